@@ -1,0 +1,29 @@
+"""RAPID: turn slow, clever LLM drivers into fast, robust driving policies.
+
+Importing this package imports nothing heavy; each name is loaded on first use.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rapid.data.dataset import load_dataset as load_dataset
+    from rapid.networks.agent import load_agent as load_agent
+    from rapid.simulator import make_env as make_env
+    from rapid.simulator import make_vec as make_vec
+
+__version__ = "0.1.0"
+__all__ = ["__version__", "load_agent", "load_dataset", "make_env", "make_vec"]
+
+_HOME = {
+    "load_agent": "rapid.networks.agent",
+    "load_dataset": "rapid.data.dataset",
+    "make_env": "rapid.simulator",
+    "make_vec": "rapid.simulator",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'rapid' has no attribute {name!r}")

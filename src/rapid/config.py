@@ -1,0 +1,473 @@
+"""The one tree of settings: frozen dataclasses, a docstring under each field, recipes, scales and TOML.
+
+A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
+``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
+``quick`` (a coffee), ``full`` (the paper's seeds and iterations). Precedence, low to high: recipe and scale,
+``--config FILE.toml``, options. This module imports nothing heavy.
+"""
+
+import dataclasses
+import os
+import tomllib
+import types
+import typing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from rapid.errors import RapidError, did_you_mean
+from rapid.scenarios import get_scenario
+
+Recipe = Literal["paper", "strong"]
+Scale = Literal["tiny", "quick", "full"]
+RECIPES: tuple[str, ...] = typing.get_args(Recipe)
+SCALES: tuple[str, ...] = typing.get_args(Scale)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TeacherConfig:
+    """Who drives in phase 1 (paper: section 3.1)."""
+
+    backend: Literal["local", "endpoint", "replay", "scripted"] = "local"
+    """`local` runs an embedded model in this process, `endpoint` asks any OpenAI-compatible server, `replay` repeats
+    recorded answers, `scripted` needs no model."""
+    model: str = "smollm2-135m"
+    """Name of the model (`rapid models list`), of the server's model, or of the scripted driver
+    (random, idle, slower, faster, rule)."""
+    style: Literal["digest", "react"] = "digest"
+    """`digest` inlines every tool result and asks for one decision; `react` lets the model call the tools in turns."""
+    base_url: str = "http://127.0.0.1:8000/v1"
+    """Address of the OpenAI-compatible server (`endpoint`)."""
+    api_key_env: str = "OPENAI_API_KEY"
+    """Environment variable that holds the key; the key itself is never written anywhere."""
+    concurrency: int = 8
+    """Requests in flight at once (`endpoint`)."""
+    requests_per_minute: float = 0.0
+    """Upper bound on requests per minute; 0 is no bound (`endpoint`)."""
+    timeout_s: float = 60.0
+    """Seconds to wait for one answer (`endpoint`)."""
+    max_retries: int = 4
+    """Tries after the first for a failed request, with backoff (`endpoint`)."""
+    max_turns: int = 8
+    """Tool calls allowed before a decision must be made (`react`)."""
+    price_in: float = 0.0
+    """Price of a million prompt tokens, in any currency; for the cost shown and budgeted."""
+    price_out: float = 0.0
+    """Price of a million answer tokens."""
+    replay_file: str = ""
+    """Recorded answers (`replay`)."""
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Phase 1: how much is collected (paper: section 4.2)."""
+
+    teacher_transitions: int = 15_000
+    """Transitions that the teacher drives; whole episodes are collected until there are at least as many."""
+    random_transitions: int = 15_000
+    """Transitions of the uniformly random driver."""
+    lockstep: int = 16
+    """Episodes driven side by side, so that the model sees a batch of prompts."""
+    max_tokens: int = 0
+    """Stop collecting when the teacher has read and written so many tokens; 0 is no limit."""
+    max_cost: float = 0.0
+    """Stop when the teacher has cost so much (see `price_in`); 0 is no limit."""
+    max_seconds: float = 0.0
+    """Stop after so many seconds of collecting; 0 is no limit."""
+    shard: str = "1/1"
+    """Which part of the episodes this process collects, as `i/n`."""
+
+
+@dataclass(frozen=True)
+class MixConfig:
+    """The offline dataset: teacher and random transitions mixed (paper: section 4.2)."""
+
+    p: float = 0.25
+    """Share of teacher transitions."""
+    size: int = 15_000
+    """Number of transitions in the mixture."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The Q-network (paper: section 3.3 and appendix "Network Implementation")."""
+
+    kind: Literal["rapid", "attentive", "mlp", "mlp-mixture"] = "rapid"
+    """`rapid` is the mixture of policies, `attentive` its single policy, `mlp` the baselines' 2x256 network,
+    `mlp-mixture` the remark's mixture of the *actions* of MLPs."""
+    num_policies: int = 2
+    """N: policy 1 is distilled from the teacher, policies 2..N are online adapters."""
+    top_k: int = 2
+    """K: policies that are active for a vehicle; policy 1 always is, the others compete for K-1 places."""
+    width: int = 64
+    """D: width of a token."""
+    heads: int = 4
+    """Attention heads."""
+    layers: int = 2
+    """L: transformer layers of a policy and of the decoder."""
+    feedforward: int = 128
+    """Width of the feed-forward layers."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Hidden layers of the MLPs."""
+    input: Literal["raw", "normalized", "ego"] = "ego"
+    """What the network reads: the features as they are, scaled to +-1 by highway-env's own ranges, or
+    ego-relative (positions and velocities of the others relative to the ego, scaled)."""
+    position: Literal["learned", "sinusoidal", "ego", "none"] = "ego"
+    """What marks a token's place: an embedding per slot, a sinusoid, a mark on the ego's row only, or nothing."""
+    action_token: Literal["prepend", "ego"] = "prepend"
+    """Where the Q-values are read: an extra learned token, prepended, or the ego's row."""
+    gate: Literal["linear", "tanh"] = "linear"
+    """Zero gate: w1 = omega1, wi = g*omegai; or wi = tanh(g)*omegai, w1 = 1 - sum wi."""
+    mask_absent: bool = True
+    """Whether rows with presence 0 are hidden from attention, so that their contents never matter."""
+
+
+@dataclass(frozen=True)
+class RobustConfig:
+    """The inner maximisation of the robust term (paper: equation 4), in features scaled to +-1."""
+
+    norm: Literal["l2", "linf"] = "linf"
+    """Norm of the ball."""
+    radius: float = 0.1
+    """Attack radius: 0.1 means 20 m in x, 0.4*lanes m in y and 8 m/s in both velocities."""
+    steps: int = 10
+    """PGD steps."""
+    step_size: float = 0.025
+    """Length of a step."""
+    random_start: bool = True
+    """Start at a random point of the ball."""
+    attack_presence: bool = False
+    """Whether the presence feature may be perturbed too."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """The training loss: TD + conservative + robust (paper: equations 2 to 4)."""
+
+    discount: float = 0.95
+    """gamma"""
+    n_step: int = 1
+    """Rewards summed before bootstrapping; never across the end of an episode."""
+    double: bool = True
+    """Double DQN: the online network chooses the next action, the target network values it."""
+    td_error: Literal["huber", "squared"] = "huber"
+    """Huber with threshold 1, as d3rlpy has it, or squared as equation 2 prints it."""
+    conservative_weight: float = 1.0
+    """alpha: weight of logsumexp Q - Q(a)."""
+    robust_weight: float = 0.5
+    """beta: weight of the robust term."""
+    robust_on: Literal["all", "teacher"] = "teacher"
+    """Transitions that get the robust term."""
+    robust_labels: Literal["hard", "soft"] = "hard"
+    """The action taken, or the teacher's probabilities where they were recorded."""
+    temperature: float = 1.0
+    """T of the softmax over Q-values in the robust term."""
+    robust: RobustConfig = field(default_factory=RobustConfig)
+    """The inner attack."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Gradient steps, shared by both training phases."""
+
+    algorithm: Literal["dqn", "bc"] = "dqn"
+    """`dqn` minimises the loss above (DQN, DDQN and CQL are its settings); `bc` is behaviour cloning."""
+    learning_rate: float = 5e-4
+    """Adam's step size."""
+    linear_decay: bool = True
+    """Let the step size fall linearly to zero over the training."""
+    batch_size: int = 64
+    """Transitions in a batch."""
+    target_update: int = 1
+    """Gradient steps between two updates of the target network."""
+    target_rate: float = 0.005
+    """Share of the online weights taken over at an update; 1 is a hard update."""
+    max_grad_norm: float = 10.0
+    """Gradients are clipped to this norm; 0 is no clipping."""
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """Phase 2: offline distillation (paper: sections 3.2 and 4.3)."""
+
+    iterations: int = 10_000
+    """Gradient steps."""
+    evaluate_every: int = 1_000
+    """Gradient steps between two evaluations; 0 is never."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """The loss of this phase."""
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    """The optimiser of this phase."""
+
+
+@dataclass(frozen=True)
+class AdaptConfig:
+    """Phase 3: online adaptation (paper: section 4.4)."""
+
+    steps: int = 10_000
+    """Environment steps, all worlds together."""
+    num_envs: int = 1
+    """Worlds stepped at once; 1 is the paper's setting."""
+    updates_per_step: float = 1.0
+    """Gradient steps per environment step."""
+    scenario: str = ""
+    """Target scenario; empty is the scenario of the data."""
+    buffer_size: int = 100_000
+    """Capacity of the replay buffer."""
+    learning_starts: int = 500
+    """Environment steps before the first gradient step."""
+    exploration_start: float = 1.0
+    """epsilon of epsilon-greedy at the first step."""
+    exploration_end: float = 0.05
+    """epsilon after the schedule."""
+    exploration_share: float = 0.2
+    """Share of the steps over which epsilon falls."""
+    offline_share: float = 0.0
+    """Share of each batch taken from the offline data."""
+    train: Literal["adapter", "all", "scratch"] = "adapter"
+    """`adapter` is the method: policy 1 frozen. `all` fine-tunes every weight. `scratch` starts from new weights."""
+    freeze_decoder: bool = False
+    """Also freeze the action decoder."""
+    evaluate_every: int = 1_000
+    """Environment steps between two evaluations; 0 is never."""
+    loss: LossConfig = field(default_factory=lambda: LossConfig(conservative_weight=0.0, robust_weight=0.0))
+    """The loss of this phase."""
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    """The optimiser of this phase."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Measuring: spawns and attacks (paper: section 4.5)."""
+
+    spawns: int = 200
+    """Episodes, one for each of the first spawn seeds of the set `test`."""
+    teacher_spawns: int = 16
+    """Episodes of the teacher, which is slow; the first of the same seeds. 0 leaves the row out."""
+    curve_spawns: int = 20
+    """Episodes of each point of a learning curve, from the set `tune`."""
+    attacks: tuple[str, ...] = ("none", "uniform", "gaussian", "fgsm", "pgd")
+    """Attacks on the observations, by name."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Every setting of a run."""
+
+    recipe: Recipe = "strong"
+    """How things are trained."""
+    scale: Scale = "quick"
+    """How much is run."""
+    scenario: str = "lane-3-density-2"
+    """Where the data is collected and policies are trained and measured."""
+    simulator: Literal["compiled", "highway-env"] = "compiled"
+    """The compiled twin, or highway-env itself (about a thousand times slower)."""
+    seed: int = 0
+    """The seed from which every random stream is derived."""
+    threads: int = 1
+    """Torch threads of this process; scale by processes instead."""
+    device: str = "cpu"
+    """Torch device."""
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    """Phase 1: the teacher."""
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    """Phase 1: the data."""
+    mix: MixConfig = field(default_factory=MixConfig)
+    """Phase 1: the mixture."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """The network."""
+    distill: DistillConfig = field(default_factory=DistillConfig)
+    """Phase 2."""
+    adapt: AdaptConfig = field(default_factory=AdaptConfig)
+    """Phase 3."""
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    """Measuring."""
+
+
+def preset(recipe: str = "strong", scale: str = "quick") -> Config:
+    """Return the settings of a recipe at a scale.
+
+    Raises:
+        RapidError: the recipe or the scale does not exist.
+    """
+    for kind, value, choices in (("recipe", recipe, RECIPES), ("scale", scale, SCALES)):
+        if value not in choices:
+            near = did_you_mean(value, choices)
+            raise RapidError(f"Unknown {kind} '{value}'{near} Choose one of {', '.join(choices)}.")
+    config = Config(recipe=typing.cast(Recipe, recipe), scale=typing.cast(Scale, scale))
+    if recipe == "paper":
+        config = _paper(config)
+    return _resize(config)
+
+
+def _paper(config: Config) -> Config:
+    """The numbers as printed (paper: hyperparameter table, sections 4.1 and 4.5)."""
+    robust = RobustConfig(norm="l2", step_size=0.01, random_start=False, attack_presence=True)
+    loss = LossConfig(discount=0.99, double=False, robust_on="all", robust=robust)
+    optimizer = OptimizerConfig(linear_decay=False, batch_size=32, target_update=50, target_rate=1.0, max_grad_norm=0.0)
+    return replace(
+        config,
+        network=NetworkConfig(input="raw", position="learned", mask_absent=False),
+        distill=DistillConfig(iterations=5_000, loss=loss, optimizer=optimizer),
+        adapt=AdaptConfig(
+            learning_starts=32,
+            loss=replace(loss, conservative_weight=0.0, robust_weight=0.0),
+            optimizer=optimizer,
+        ),
+    )
+
+
+def _resize(config: Config) -> Config:
+    """Apply the sizes of a scale; `full` keeps those of the recipe."""
+    if config.scale == "full":
+        return config
+    tiny = config.scale == "tiny"
+    return replace(
+        config,
+        collect=replace(
+            config.collect,
+            teacher_transitions=60 if tiny else 1_000,
+            random_transitions=180 if tiny else 3_000,
+            lockstep=4 if tiny else 16,
+        ),
+        mix=replace(config.mix, size=200 if tiny else 4_000),
+        distill=replace(config.distill, iterations=40 if tiny else 2_000, evaluate_every=20 if tiny else 500),
+        adapt=replace(
+            config.adapt,
+            steps=200 if tiny else 10_000,
+            learning_starts=50 if tiny else 500,
+            evaluate_every=100 if tiny else 2_000,
+        ),
+        evaluate=replace(
+            config.evaluate,
+            spawns=4 if tiny else 100,
+            teacher_spawns=2 if tiny else 16,
+            curve_spawns=2 if tiny else 20,
+        ),
+    )
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Return a dataclass as plain dictionaries and lists, ready for JSON or TOML."""
+    return dataclasses.asdict(config)
+
+
+def apply_overrides(config: T, overrides: dict[str, Any], where: str = "", source: str = "the settings") -> T:
+    """Return `config` with nested `overrides` applied, every key and type checked.
+
+    Raises:
+        RapidError: a key that does not exist, or a value of the wrong type; the message names the key and `source`.
+    """
+    hints = typing.get_type_hints(type(config))
+    changes: dict[str, Any] = {}
+    for key, value in overrides.items():
+        path = f"{where}.{key}" if where else key
+        if key not in hints:
+            raise RapidError(
+                f"Unknown setting '{path}' in {source}{did_you_mean(key, hints)} Known here: {', '.join(hints)}."
+            )
+        current = getattr(config, key)
+        if dataclasses.is_dataclass(current):
+            if not isinstance(value, dict):
+                raise RapidError(f"Setting '{path}' in {source} must be a table, not {value!r}.")
+            changes[key] = apply_overrides(current, value, path, source)
+        else:
+            changes[key] = _checked(value, hints[key], path, source)
+    return dataclasses.replace(config, **changes)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
+
+
+def _checked(value: Any, hint: Any, path: str, source: str) -> Any:
+    """Return `value` if it has the type `hint`, with integers widened to floats and lists turned into tuples."""
+    origin = typing.get_origin(hint)
+    if isinstance(hint, types.GenericAlias) and origin is tuple:
+        if isinstance(value, list | tuple):
+            return tuple(_checked(item, typing.get_args(hint)[0], path, source) for item in value)
+        expected = "a list"
+    elif origin is Literal:
+        choices = typing.get_args(hint)
+        if value in choices:
+            return value
+        hint_text = did_you_mean(value, choices) if isinstance(value, str) else "."
+        raise RapidError(
+            f"Setting '{path}' in {source} is {value!r}{hint_text} Choose one of {', '.join(map(str, choices))}."
+        )
+    elif hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif type(value) is hint:
+        return value
+    else:
+        expected = f"of type {hint.__name__}"
+    raise RapidError(f"Setting '{path}' in {source} must be {expected}, not {value!r}.")
+
+
+def load_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a TOML file of settings.
+
+    Raises:
+        RapidError: the file is missing, unreadable or not TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise RapidError(f"Cannot read the settings file '{path}': {error}. Give the path of a TOML file.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise RapidError(f"The settings file '{path}' is not valid TOML: {error}. Correct that line.") from error
+
+
+def validate(config: Config) -> Config:
+    """Return `config` if its numbers make sense together.
+
+    Raises:
+        RapidError: the first setting that does not, with what was expected.
+    """
+    get_scenario(config.scenario)
+    if config.adapt.scenario:
+        get_scenario(config.adapt.scenario)
+    network, collect, evaluate = config.network, config.collect, config.evaluate
+    losses = {"distill": config.distill, "adapt": config.adapt}
+    checks: list[tuple[bool, str, Any, str]] = [
+        (0 <= config.seed < 2**32, "seed", config.seed, "between 0 and 2^32 - 1"),
+        (config.threads >= 1, "threads", config.threads, "at least 1"),
+        (collect.teacher_transitions >= 0, "collect.teacher_transitions", collect.teacher_transitions, "at least 0"),
+        (collect.random_transitions >= 0, "collect.random_transitions", collect.random_transitions, "at least 0"),
+        (collect.lockstep >= 1, "collect.lockstep", collect.lockstep, "at least 1"),
+        (0 <= config.mix.p <= 1, "mix.p", config.mix.p, "between 0 and 1"),
+        (config.mix.size >= 1, "mix.size", config.mix.size, "at least 1"),
+        (network.num_policies >= 1, "network.num_policies", network.num_policies, "at least 1"),
+        (
+            1 <= network.top_k <= network.num_policies,
+            "network.top_k",
+            network.top_k,
+            f"between 1 and network.num_policies = {network.num_policies}",
+        ),
+        (network.layers >= 1, "network.layers", network.layers, "at least 1"),
+        (
+            network.heads >= 1 and network.width % network.heads == 0,
+            "network.width",
+            network.width,
+            f"a multiple of network.heads = {network.heads}",
+        ),
+        (config.adapt.num_envs >= 1, "adapt.num_envs", config.adapt.num_envs, "at least 1"),
+        (config.adapt.updates_per_step > 0, "adapt.updates_per_step", config.adapt.updates_per_step, "above 0"),
+        (0 <= config.adapt.offline_share < 1, "adapt.offline_share", config.adapt.offline_share, "in [0, 1)"),
+        (evaluate.spawns >= 1, "evaluate.spawns", evaluate.spawns, "at least 1"),
+    ]
+    for name, phase in losses.items():
+        loss, optimizer = phase.loss, phase.optimizer
+        checks += [
+            (0 <= loss.discount <= 1, f"{name}.loss.discount", loss.discount, "between 0 and 1"),
+            (loss.n_step >= 1, f"{name}.loss.n_step", loss.n_step, "at least 1"),
+            (loss.temperature > 0, f"{name}.loss.temperature", loss.temperature, "above 0"),
+            (loss.robust.radius >= 0, f"{name}.loss.robust.radius", loss.robust.radius, "at least 0"),
+            (loss.robust.steps >= 1, f"{name}.loss.robust.steps", loss.robust.steps, "at least 1"),
+            (optimizer.learning_rate > 0, f"{name}.optimizer.learning_rate", optimizer.learning_rate, "above 0"),
+            (optimizer.batch_size >= 1, f"{name}.optimizer.batch_size", optimizer.batch_size, "at least 1"),
+            (optimizer.target_update >= 1, f"{name}.optimizer.target_update", optimizer.target_update, "at least 1"),
+            (0 < optimizer.target_rate <= 1, f"{name}.optimizer.target_rate", optimizer.target_rate, "in (0, 1]"),
+        ]
+    for good, setting, value, expected in checks:
+        if not good:
+            raise RapidError(f"Setting '{setting}' is {value}, but must be {expected}.")
+    return config

@@ -1,0 +1,113 @@
+"""Named driving scenarios, as data (paper: section 4.1 and the table "Highway Environment Configuration").
+
+A name reads ``lane-N-density-D[-fast][:progress]``: N lanes, traffic density D, the dynamics of ``highway-v0``
+or, with ``-fast``, of ``highway-fast-v0``, and one of two rewards. This module imports nothing heavy.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from rapid.errors import RapidError, did_you_mean
+
+Dynamics = Literal["v0", "fast"]
+Reward = Literal["normalized", "progress"]
+
+ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+"""The five meta-actions, at their index in the action space of ``DiscreteMetaAction``."""
+LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
+
+FEATURES = ("presence", "x", "y", "vx", "vy")
+"""The columns of an observation row; a row is a vehicle, the first row is the ego."""
+NUM_VEHICLES = 15
+NUM_FEATURES = len(FEATURES)
+NUM_ACTIONS = len(ACTIONS)
+
+TARGET_SPEEDS = tuple(4.0 * i for i in range(9))
+"""``linspace(0, 32, 9)`` m/s, the speeds that FASTER and SLOWER step through."""
+
+PAPER_SCENARIOS = ("lane-3-density-2", "lane-4-density-2.5", "lane-5-density-3")
+
+_NAME = re.compile(r"lane-(\d+)-density-(\d+(?:\.\d+)?)(-fast)?(?::([a-z]+))?")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One driving task: the road, the traffic, the physics and the reward."""
+
+    lanes: int
+    density: float
+    dynamics: Dynamics = "v0"
+    reward: Reward = "normalized"
+
+    @property
+    def name(self) -> str:
+        """The name that :func:`get_scenario` reads back."""
+        fast = "-fast" if self.dynamics == "fast" else ""
+        reward = "" if self.reward == "normalized" else f":{self.reward}"
+        return f"lane-{self.lanes}-density-{self.density:g}{fast}{reward}"
+
+    @property
+    def env_id(self) -> str:
+        """The id under which highway-env registers these dynamics."""
+        return "highway-fast-v0" if self.dynamics == "fast" else "highway-v0"
+
+    def config(self) -> dict[str, Any]:
+        """Return the configuration as highway-env takes it, on top of the defaults of :attr:`env_id`."""
+        config: dict[str, Any] = {
+            "observation": {
+                "type": "Kinematics",
+                "features": list(FEATURES),
+                "absolute": True,
+                "normalize": False,
+                "vehicles_count": NUM_VEHICLES,
+                "see_behind": True,
+            },
+            "action": {"type": "DiscreteMetaAction", "target_speeds": list(TARGET_SPEEDS)},
+            "lanes_count": self.lanes,
+            "vehicles_density": self.density,
+            "duration": 30,
+            "show_trajectories": True,
+        }
+        if self.reward == "progress":
+            # The paper's reward pays a parked car 0.67 a step; here only distance and not crashing count.
+            config |= {
+                "reward_speed_range": [0, 32],
+                "high_speed_reward": 1.0,
+                "right_lane_reward": 0.0,
+                "collision_reward": -5.0,
+                "normalize_reward": False,
+            }
+        return config
+
+
+SCENARIOS: tuple[str, ...] = tuple(
+    f"lane-{lanes}-density-{density}{fast}{reward}"
+    for reward in ("", ":progress")
+    for fast in ("", "-fast")
+    for lanes in (3, 4, 5)
+    for density in ("2", "2.5", "3")
+)
+"""The scenarios that are listed; any other ``lane-N-density-D`` works by name too."""
+
+
+def get_scenario(name: str) -> Scenario:
+    """Return the scenario called `name`.
+
+    Raises:
+        RapidError: the name does not follow the pattern, or asks for a road that cannot exist.
+    """
+    match = _NAME.fullmatch(name.strip())
+    if match is None or match[4] not in (None, "normalized", "progress"):
+        raise RapidError(
+            f"Unknown scenario '{name}'{did_you_mean(name, SCENARIOS)} Expected lane-N-density-D with an optional "
+            f"-fast and an optional :progress. Listed scenarios: {', '.join(SCENARIOS[:9])}; each also with -fast, "
+            "with :progress, or with both."
+        )
+    lanes, density = int(match[1]), float(match[2])
+    if not 1 <= lanes <= 20:
+        raise RapidError(f"Impossible scenario '{name}': a road has 1 to 20 lanes, not {lanes}.")
+    if not 0 < density <= 20:
+        raise RapidError(f"Impossible scenario '{name}': the density must lie in (0, 20], not {match[2]}.")
+    reward: Reward = "progress" if match[4] == "progress" else "normalized"
+    return Scenario(lanes, density, "fast" if match[3] else "v0", reward)
