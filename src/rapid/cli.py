@@ -1,0 +1,80 @@
+"""The command line: one verb per step of the data's way.
+
+This module answers ``rapid --help`` by itself and imports a verb's machinery only when the verb is called.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+
+import rapid
+from rapid.errors import RapidError, did_you_mean
+
+VERBS: dict[str, str] = {
+    "run": "do everything: collect, mix, distill, adapt, evaluate, report",
+    "collect": "phase 1: let a teacher drive and keep every step",
+    "mix": "phase 1: mix teacher and random transitions into one dataset",
+    "distill": "phase 2: offline RL with the robust term, into a policy",
+    "adapt": "phase 3: online DQN in the target scenario, the distilled policy frozen",
+    "evaluate": "drive policies and scripted drivers over fixed spawns, clean and attacked",
+    "report": "write the page of a run again",
+    "models": "list, fetch, verify and remove the embedded language models",
+    "verify-simulator": "hold the compiled simulator against highway-env, step by step",
+    "doctor": "check this machine and say what to do about each failure",
+}
+
+
+def help_text() -> str:
+    """Return what ``rapid --help`` prints."""
+    width = max(map(len, VERBS))
+    verbs = "\n".join(f"  {verb:<{width}}  {text}" for verb, text in VERBS.items())
+    return (
+        "usage: rapid VERB [options]\n\n"
+        "Turn slow, clever LLM drivers into fast, robust driving policies.\n\n"
+        f"verbs, in the order of the data's way:\n{verbs}\n\n"
+        "options of every verb:\n"
+        "  --help     the verb's own options\n"
+        "  --debug    show the traceback of an error\n"
+        "  --version  print the version\n\n"
+        "Begin with: rapid run            (no key, no GPU; about ten minutes on two cores)"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(help_text())
+        raise SystemExit(0)
+    if words[0] in ("--version", "version"):
+        print(f"rapid {rapid.__version__}")
+        raise SystemExit(0)
+    try:
+        if words[0] not in VERBS:
+            raise RapidError(f"Unknown verb '{words[0]}'{did_you_mean(words[0], VERBS)} Verbs: {', '.join(VERBS)}.")
+        # Several processes scale better than several threads; see docs/architecture.md.
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        from rapid.verbs import call
+
+        code = call(words[0], words[1:])
+    except RapidError as error:
+        if debug:
+            raise
+        print(f"rapid: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        print("\nrapid: interrupted; the same command goes on from here.", file=sys.stderr)
+        raise SystemExit(130) from None
+    except BrokenPipeError:
+        # The reader of our output went away (`rapid ... | head`): not an error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(0) from None
+    raise SystemExit(code)
+
+
+if __name__ == "__main__":
+    main()
