@@ -7,6 +7,7 @@ A *recipe* says how things are trained: ``paper`` uses the numbers as printed, e
 """
 
 import dataclasses
+import json
 import os
 import tomllib
 import types
@@ -471,3 +472,30 @@ def validate(config: Config) -> Config:
         if not good:
             raise RapidError(f"Setting '{setting}' is {value}, but must be {expected}.")
     return config
+
+
+def to_toml(settings: dict[str, Any]) -> str:
+    """Return nested settings as TOML; :func:`load_toml` reads the same values back."""
+    lines: list[str] = []
+
+    def table(values: dict[str, Any], path: str) -> None:
+        if path:
+            lines.extend(("", f"[{path}]"))
+        lines.extend(f"{key} = {_toml_value(value)}" for key, value in values.items() if not isinstance(value, dict))
+        for key, value in values.items():
+            if isinstance(value, dict):
+                table(value, f"{path}.{key}" if path else key)
+
+    table(settings, "")
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        # TOML's basic strings escape as JSON's do, except for DEL.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return f"[{', '.join(map(_toml_value, value))}]"

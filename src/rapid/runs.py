@@ -1,0 +1,154 @@
+"""A run's directory: who made it, with what settings, which steps are done. The same command goes on where it was.
+
+Layout: ``run.json`` (settings, versions, commit, command), ``config.toml`` (the settings, for ``--config``), one folder
+per step, and ``steps/STEP.json`` once a step is done.
+"""
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import rapid
+from rapid.config import Config, to_dict, to_toml
+from rapid.errors import RapidError, did_you_mean
+from rapid.files import read_json, write_json, write_text
+
+FORMAT = 1
+_PACKAGES = (
+    "torch",
+    "numpy",
+    "numba",
+    "gymnasium",
+    "highway-env",
+    "transformers",
+    "xllamacpp",
+    "safetensors",
+    "pyarrow",
+)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that decide what a run computes: this package, Python, the platform, the libraries."""
+    found = {"rapid-driving": rapid.__version__, "python": platform.python_version(), "platform": platform.platform()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def commit() -> str:
+    """Return the commit of the source tree, with ``+changes`` if it was edited since; empty outside a checkout."""
+    here = Path(__file__).resolve().parent
+    try:
+        top = _git(here, "rev-parse", "--show-toplevel")
+        if Path(top) != here.parent.parent:  # installed inside somebody else's repository
+            return ""
+        changed = _git(here, "status", "--porcelain", "--untracked-files=no")
+        return _git(here, "rev-parse", "HEAD") + ("+changes" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _git(directory: Path, *arguments: str) -> str:
+    call = ["git", "-C", str(directory), *arguments]
+    return subprocess.run(call, check=True, capture_output=True, text=True, timeout=10).stdout.strip()
+
+
+class RunDirectory:
+    """The directory of one run, opened for a list of `steps`.
+
+    Raises:
+        RapidError: the directory was made by other settings, by another format, is no run's, or cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], config: Config, steps: Sequence[str]) -> None:
+        self.path = Path(path)
+        self.steps = tuple(steps)
+        manifest = self.path / "run.json"
+        if manifest.exists():
+            self._check_same(read_json(manifest, "run manifest"), config)
+        elif self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            raise RapidError(
+                f"'{self.path}' exists and is not the directory of a run. Choose another --directory, or empty it."
+            )
+        else:
+            write_text(self.path / "config.toml", to_toml(to_dict(config)))
+            write_json(
+                manifest,
+                {
+                    "format": FORMAT,
+                    "config": to_dict(config),
+                    "versions": versions(),
+                    "commit": commit(),
+                    "command": sys.argv[1:],
+                    "started": datetime.now(UTC).isoformat(timespec="seconds"),
+                },
+            )
+
+    def _check_same(self, manifest: Any, config: Config) -> None:
+        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or "config" not in manifest:
+            raise RapidError(
+                f"'{self.path / 'run.json'}' is not a run manifest of format {FORMAT}. It is damaged or was made by "
+                "another version; choose another --directory."
+            )
+        # The number of threads decides how fast, not what; a run may go on with another.
+        now = to_dict(replace(config, threads=1))
+        changes = _differences({**manifest["config"], "threads": 1}, now)
+        if changes:
+            raise RapidError(
+                f"The run in '{self.path}' was made with other settings: {'; '.join(changes[:6])}"
+                f"{f'; and {len(changes) - 6} more' if len(changes) > 6 else ''}. Nothing was changed. Repeat its own "
+                f"settings (rapid run --config {self.path / 'config.toml'}), or choose another --directory."
+            )
+
+    def is_done(self, step: str) -> bool:
+        """Whether `step` was finished."""
+        return self._mark(step).exists()
+
+    def finish(self, step: str, seconds: float, **facts: Any) -> None:
+        """Mark `step` as done, with the time it took and facts about it."""
+        write_json(self._mark(step), {"step": step, "seconds": round(seconds, 2), "time": time.time(), **facts})
+
+    def facts(self, step: str) -> dict[str, Any]:
+        """Return what :meth:`finish` wrote, or nothing if the step is not done."""
+        return read_json(self._mark(step), "step record") if self.is_done(step) else {}
+
+    def restart_from(self, step: str) -> None:
+        """Forget `step` and all later ones: their marks and their folders.
+
+        Raises:
+            RapidError: there is no such step.
+        """
+        if step not in self.steps:
+            raise RapidError(f"Unknown step '{step}'{did_you_mean(step, self.steps)} Steps: {', '.join(self.steps)}.")
+        for later in self.steps[self.steps.index(step) :]:
+            self._mark(later).unlink(missing_ok=True)
+            shutil.rmtree(self.path / later, ignore_errors=True)
+
+    def _mark(self, step: str) -> Path:
+        return self.path / "steps" / f"{step}.json"
+
+
+def _differences(old: Any, new: Any, where: str = "") -> list[str]:
+    """Return the settings that differ, each as ``path: old -> new``."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        found: list[str] = []
+        for key in [*old, *(key for key in new if key not in old)]:
+            found += _differences(old.get(key), new.get(key), f"{where}.{key}" if where else key)
+        return found
+    if isinstance(new, tuple):
+        new = list(new)
+    if isinstance(old, tuple):
+        old = list(old)
+    return [] if old == new else [f"{where}: {old!r} there, {new!r} now"]

@@ -1,0 +1,142 @@
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rapid import config as settings
+from rapid.config import Config, apply_overrides, load_toml, preset, to_dict, to_toml, validate
+from rapid.errors import RapidError
+
+PRESETS = [(recipe, scale) for recipe in settings.RECIPES for scale in settings.SCALES]
+
+
+def fields_without_docs(kind: type) -> list[str]:
+    """The fields of a dataclass tree that have no docstring below them in the source."""
+    import ast
+    import inspect
+
+    body = ast.parse(inspect.getsource(kind)).body[0]
+    assert isinstance(body, ast.ClassDef)
+    bare = []
+    for statement, after in zip(body.body, [*body.body[1:], None], strict=True):
+        if isinstance(statement, ast.AnnAssign) and not (
+            isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        ):
+            bare.append(f"{kind.__name__}.{ast.unparse(statement.target)}")
+    return bare
+
+
+@pytest.mark.parametrize(("recipe", "scale"), PRESETS)
+def test_every_preset_is_valid_and_survives_toml(recipe: str, scale: str, tmp_path: Path):
+    config = validate(preset(recipe, scale))
+    assert (config.recipe, config.scale) == (recipe, scale)
+    file = tmp_path / "config.toml"
+    file.write_text(to_toml(to_dict(config)))
+    assert apply_overrides(preset(), load_toml(file)) == config
+
+
+def test_the_paper_recipe_is_the_printed_one():
+    paper = preset("paper", "full")
+    assert (paper.distill.iterations, paper.adapt.steps) == (5_000, 10_000)
+    assert paper.distill.optimizer.batch_size == 32
+    assert paper.distill.optimizer.target_update == 50
+    assert paper.distill.optimizer.target_rate == 1.0
+    assert paper.distill.loss.robust_weight == 0.5
+    robust = paper.distill.loss.robust
+    assert (robust.norm, robust.radius, robust.steps, robust.step_size) == ("l2", 0.1, 10, 0.01)
+    assert paper.adapt.loss.robust_weight == paper.adapt.loss.conservative_weight == 0
+    assert (paper.mix.p, paper.mix.size) == (0.25, 15_000)
+    assert (paper.adapt.exploration_start, paper.adapt.exploration_end, paper.adapt.buffer_size) == (1, 0.05, 100_000)
+
+
+def test_every_field_has_a_docstring():
+    kinds = [kind for kind in vars(settings).values() if dataclasses.is_dataclass(kind)]
+    assert len(kinds) > 8
+    assert [name for kind in kinds for name in fields_without_docs(kind)] == []  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        ({"distil": {}}, "did you mean 'distill'"),
+        ({"distill": {"loss": {"discont": 1}}}, "distill.loss.discont"),
+        ({"distill": {"loss": 3}}, "must be a table"),
+        ({"seed": "0"}, "of type int"),
+        ({"seed": True}, "of type int"),
+        ({"seed": 1.5}, "of type int"),
+        ({"network": {"kind": "mpl"}}, "did you mean 'mlp'"),
+        ({"network": {"hidden": [1, "2"]}}, "network.hidden"),
+        ({"evaluate": {"attacks": "pgd"}}, "must be a list"),
+    ],
+)
+def test_wrong_settings_are_named(overrides: dict[str, Any], says: str):
+    with pytest.raises(RapidError) as error:
+        apply_overrides(preset(), overrides, source="my.toml")
+    assert says in str(error.value)
+    assert "my.toml" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "setting"),
+    [
+        ({"network": {"top_k": 3}}, "network.top_k"),
+        ({"network": {"num_policies": 0}}, "network.num_policies"),
+        ({"network": {"width": 30}}, "network.width"),
+        ({"mix": {"p": 1.5}}, "mix.p"),
+        ({"mix": {"p": float("nan")}}, "mix.p"),
+        ({"adapt": {"offline_share": 1.0}}, "adapt.offline_share"),
+        ({"distill": {"loss": {"discount": -0.1}}}, "distill.loss.discount"),
+        ({"adapt": {"optimizer": {"target_rate": 0.0}}}, "adapt.optimizer.target_rate"),
+        ({"adapt": {"scenario": "lane-x"}}, "scenario"),
+    ],
+)
+def test_impossible_numbers_are_refused(overrides: dict[str, Any], setting: str):
+    with pytest.raises(RapidError) as error:
+        validate(apply_overrides(preset(), overrides))
+    assert setting in str(error.value)
+
+
+def test_integers_widen_to_floats_and_lists_to_tuples():
+    config = apply_overrides(preset(), {"mix": {"p": 1}, "network": {"hidden": [8, 8]}})
+    assert isinstance(config.mix.p, float)
+    assert config.network.hidden == (8, 8)
+
+
+@pytest.mark.parametrize(("recipe", "scale"), [("papr", "quick"), ("paper", "huge")])
+def test_unknown_presets(recipe: str, scale: str):
+    with pytest.raises(RapidError, match="Unknown"):
+        preset(recipe, scale)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path):
+    with pytest.raises(RapidError, match="Cannot read"):
+        load_toml(tmp_path / "none.toml")
+    bad = tmp_path / "bad.toml"
+    bad.write_text("a = = 1")
+    with pytest.raises(RapidError, match="not valid TOML"):
+        load_toml(bad)
+    bad.write_bytes(b"\xff\xfe")
+    with pytest.raises(RapidError, match="Cannot read"):
+        load_toml(bad)
+
+
+toml_values = st.recursive(
+    st.one_of(st.booleans(), st.integers(-(2**53), 2**53), st.floats(allow_nan=False), st.text()),
+    lambda inner: st.dictionaries(st.from_regex(r"[a-z_]{1,6}", fullmatch=True), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.from_regex(r"[a-z_]{1,6}", fullmatch=True), toml_values, max_size=5))
+def test_toml_round_trip(tree: dict[str, Any]):
+    assert tomllib.loads(to_toml(tree)) == tree
+
+
+def test_the_tree_is_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        preset().seed = 1  # pyright: ignore[reportAttributeAccessIssue]
+    assert isinstance(preset(), Config)

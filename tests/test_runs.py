@@ -1,0 +1,63 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rapid.config import apply_overrides, load_toml, preset
+from rapid.errors import RapidError
+from rapid.files import read_json
+from rapid.runs import RunDirectory
+
+STEPS = ("collect", "mix", "distill")
+
+
+def test_a_run_directory_says_how_it_was_made(tmp_path: Path):
+    config = preset("paper", "tiny")
+    RunDirectory(tmp_path / "run", config, STEPS)
+    manifest = read_json(tmp_path / "run" / "run.json")
+    assert manifest["config"]["scale"] == "tiny"
+    assert manifest["versions"]["torch"]
+    assert apply_overrides(preset(), load_toml(tmp_path / "run" / "config.toml")) == config
+
+
+def test_the_same_settings_go_on_and_others_are_refused(tmp_path: Path):
+    config = preset("strong", "tiny")
+    run = RunDirectory(tmp_path, config, STEPS)
+    run.finish("collect", 1.5, transitions=7)
+    again = RunDirectory(tmp_path, replace(config, threads=2), STEPS)
+    assert again.is_done("collect")
+    assert not again.is_done("mix")
+    assert again.facts("collect")["transitions"] == 7
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(RapidError, match=r"seed: 0 there, 1 now") as error:
+        RunDirectory(tmp_path, replace(config, seed=1), STEPS)
+    assert "--directory" in str(error.value)
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_redoing_from_a_step_keeps_the_earlier_ones(tmp_path: Path):
+    run = RunDirectory(tmp_path, preset(), STEPS)
+    for step in STEPS:
+        (tmp_path / step).mkdir()
+        (tmp_path / step / "x").write_text(step)
+        run.finish(step, 1)
+    run.restart_from("mix")
+    assert [run.is_done(step) for step in STEPS] == [True, False, False]
+    assert (tmp_path / "collect" / "x").exists()
+    assert not (tmp_path / "mix").exists()
+    with pytest.raises(RapidError, match="did you mean 'distill'"):
+        run.restart_from("distil")
+
+
+def test_foreign_and_damaged_directories_are_left_alone(tmp_path: Path):
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(RapidError, match="not the directory of a run"):
+        RunDirectory(tmp_path, preset(), STEPS)
+    other = tmp_path / "run"
+    RunDirectory(other, preset(), STEPS)
+    (other / "run.json").write_text("{")
+    with pytest.raises(RapidError, match="damaged"):
+        RunDirectory(other, preset(), STEPS)
+    (other / "run.json").write_text('{"format": 99}')
+    with pytest.raises(RapidError, match="another version"):
+        RunDirectory(other, preset(), STEPS)
