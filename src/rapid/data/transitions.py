@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,8 +90,8 @@ class Transitions:
             array = getattr(self, name)
             if array.shape != (count, *shape) or array.dtype != dtype:
                 raise RapidError(
-                    f"In {what}, '{name}' has shape {array.shape} and type {array.dtype}; expected {(count, *shape)} and "
-                    f"{np.dtype(dtype)}. The data was made for other spaces; collect it with this version."
+                    f"In {what}, '{name}' has shape {array.shape} and type {array.dtype}; expected "
+                    f"{(count, *shape)} and {np.dtype(dtype)}. The data was made for other spaces; collect it anew."
                 )
         probabilities = self.probabilities_NA
         absent_N = np.isnan(probabilities).all(1)
@@ -122,11 +123,12 @@ def concatenate(parts: Sequence[Transitions]) -> Transitions:
     for part in parts:
         shifted.append(replace(part, episode_N=part.episode_N + first))
         first += int(part.episode_N.max()) + 1 if len(part) else 0
-    return Transitions(
-        **{field.name: np.concatenate([getattr(part, field.name) for part in shifted]) for field in fields(Transitions)}
-    )
+    names = [field.name for field in fields(Transitions)]
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in shifted]) for name in names}
+    return Transitions(**arrays)
 
 
 def empty() -> Transitions:
     """Return no transitions."""
-    return Transitions(**{name: np.zeros((0, *shape), dtype) for name, (shape, dtype) in _SHAPES.items()})
+    arrays: dict[str, Any] = {name: np.zeros((0, *shape), dtype) for name, (shape, dtype) in _SHAPES.items()}
+    return Transitions(**arrays)

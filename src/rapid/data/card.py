@@ -1,0 +1,77 @@
+"""The dataset card: what a stranger must know before using a dataset, as Markdown."""
+
+import json
+from typing import Any
+
+from rapid.data.dataset import LICENCE, Dataset, summary
+from rapid.data.transitions import SOURCES
+from rapid.scenarios import get_scenario
+
+
+def card(dataset: Dataset) -> str:
+    """Return the card: scenario, drivers and their prompts, counts, returns, crashes, actions, decisions, licence."""
+    facts = summary(dataset)
+    scenario = get_scenario(dataset.scenario)
+    lines = [
+        f"# {dataset.scenario}: {len(dataset)} transitions",
+        "",
+        f"Highway driving, {scenario.lanes} lanes, density {scenario.density:g}, dynamics of `{scenario.env_id}`, "
+        f"reward `{scenario.reward}`. One decision a second, at most 30 an episode. Licence: {LICENCE}.",
+        "",
+        "| source | driver | transitions | whole episodes | return (mean ± std over episodes) | return quartiles "
+        "| crashed | speed, m/s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    present = [name for name in SOURCES if name in facts]
+    for name in present:
+        row = facts[name]
+        score, quartiles, crashed = "–", "–", "–"
+        if row["whole_episodes"]:
+            score = f"{row['return_mean']:.2f} ± {row['return_std']:.2f}"
+            quartiles = " / ".join(f"{value:.1f}" for value in row["return_quantiles"])
+            crashed = f"{row['crash_share']:.1%}"
+        driver = dataset.drivers.get(name, {}).get("name", "unknown")
+        lines.append(
+            f"| {name} | {driver} | {row['transitions']} | {row['whole_episodes']} | {score} | {quartiles} | {crashed} "
+            f"| {row['mean_speed']:.1f} |"
+        )
+    lines += ["", "| share of actions | " + " | ".join(facts[present[0]]["actions"] if present else ()) + " |"]
+    lines.append("|" + "---|" * (1 + len(facts[present[0]]["actions"]) if present else 1))
+    lines += [
+        f"| {name} | " + " | ".join(f"{share:.1%}" for share in facts[name]["actions"].values()) + " |"
+        for name in present
+    ]
+    if dataset.mixture is not None:
+        how = dataset.mixture
+        lines += [
+            "",
+            f"Mixed with p = {how['p']:g} teacher transitions at the level of the {how['level']}, seed {how['seed']}.",
+        ]
+    if "decisions" in facts:
+        lines += ["", "## Decisions", "", *_decision_lines(facts["decisions"], len(dataset))]
+    lines += ["", "## Drivers"]
+    for name, identity in dataset.drivers.items():
+        lines += ["", f"`{name}`:", "", "```json", json.dumps(identity, indent=2, ensure_ascii=False), "```"]
+    lines += ["", "## Reading it", "", *_READING]
+    return "\n".join(lines) + "\n"
+
+
+def _decision_lines(decisions: dict[str, Any], count: int) -> list[str]:
+    """Return what the log adds up to, as a list."""
+    status = ", ".join(f"{name} {amount}" for name, amount in decisions["status"].items())
+    return [
+        f"- Status: {status}; {decisions['retries']:g} retries",
+        f"- {decisions['prompts']} different prompts",
+        f"- {decisions['tokens_in']:g} tokens read, {decisions['tokens_out']:g} written, cost {decisions['cost']:g}",
+        f"- {decisions['seconds']:.1f} s of deciding, {decisions['seconds'] / max(count, 1):.3f} s a decision",
+    ]
+
+
+_READING = (
+    "- `rapid.load_dataset(directory)` checks the files against their hashes and gives `Transitions` (NumPy arrays).",
+    "- `transitions.parquet`: one row a step. `obs` is 15 vehicles × 5 features (presence, x, y, vx, vy; metres and "
+    "m/s, absolute), row 0 the ego. `next_obs` is null where it equals the `obs` of the next row. `terminated` is a "
+    "crash, `truncated` the clock. `source` 0 is the teacher, 1 the random driver.",
+    "- `teacher_log.parquet`: one row a decision, with prompt hash, answer, explanation, status, tokens, seconds and "
+    "transcript.",
+)
