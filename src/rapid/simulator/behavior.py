@@ -1,0 +1,237 @@
+# pyright: basic
+# Kernels: the types that matter here are numba's, which pyright does not know.
+"""What the vehicles decide in a frame: the ego's controller, IDM along the lane, MOBIL across lanes.
+
+The rules and constants are highway-env's (``vehicle/controller.py``, ``vehicle/behavior.py``, ``road/road.py``).
+Positions are fixed while vehicles act, so neighbours are found through the order by x, which the move phase keeps.
+"""
+
+import math
+
+from rapid.scenarios import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER
+from rapid.simulator.compile import kernel
+from rapid.simulator.spawn import LANE_WIDTH, nearest_speed_index
+from rapid.simulator.state import (
+    ACCELERATION,
+    COS,
+    CRASHED,
+    EXPONENT,
+    HEADING,
+    LANE,
+    ORDER,
+    RANK,
+    SIN,
+    SLIP,
+    SPEED,
+    SPEED_INDEX,
+    TARGET_LANE,
+    TARGET_SPEED,
+    TIMER,
+    VX,
+    VY,
+    X,
+    Y,
+)
+
+ROAD_LENGTH = 10_000.0
+SPEED_LIMIT = 30.0
+VEHICLE_LENGTH = 5.0
+HALF_LENGTH = 2.5
+
+SPEED_GAIN = 1 / 0.6
+LATERAL_GAIN = 1 / 0.6
+HEADING_GAIN = 1 / 0.2
+MAX_HEADING = math.pi / 4
+# The slip angle is atan(tan(steering) / 2), and steering = atan(2 tan(slip)) is clipped to a third of pi: in terms of
+# the sine of the slip angle that is one clip, at the sine of atan(tan(pi / 3) / 2).
+MAX_SLIP = math.sqrt(3 / 7)
+
+MAX_ACCELERATION = 6.0
+COMFORT_ACCELERATION = 3.0
+GAP_WANTED = 10.0
+TIME_WANTED = 1.5
+TWICE_ROOT = 2 * math.sqrt(15.0)
+LANE_CHANGE_DELAY = 1.0
+MIN_GAIN = 0.2
+MAX_BRAKING_IMPOSED = 2.0
+REACH = 3.0
+"""A vehicle belongs to every lane whose centre is at most this far [m]."""
+
+
+@kernel
+def not_zero(value):
+    """Return `value`, or a hundredth of its sign where it is smaller than that."""
+    if abs(value) > 0.01:
+        return value
+    return 0.01 if value >= 0 else -0.01
+
+
+@kernel
+def wrap_angle(angle):
+    """Return `angle` in [-pi, pi)."""
+    turned = angle + math.pi
+    if not 0.0 <= turned < 2 * math.pi:
+        turned %= 2 * math.pi
+    return turned - math.pi
+
+
+@kernel
+def clip(value, low, high):
+    """Return `value` limited to [low, high]."""
+    return min(max(value, low), high)
+
+
+@kernel
+def on_lane(cars, j, lane):
+    """Whether neighbours searching `lane` see vehicle `j`."""
+    x = cars[X, j]
+    return abs(cars[Y, j] - LANE_WIDTH * lane) <= REACH and -VEHICLE_LENGTH <= x < ROAD_LENGTH + VEHICLE_LENGTH
+
+
+@kernel
+def reachable(cars, i, lane):
+    """Whether vehicle `i` is close enough to change to `lane`."""
+    x = cars[X, i]
+    return abs(cars[Y, i] - LANE_WIDTH * lane) <= 2 * LANE_WIDTH and 0.0 <= x < ROAD_LENGTH + VEHICLE_LENGTH
+
+
+@kernel
+def _first_at(cars, tags, i):
+    """Return the lowest rank among the vehicles that are exactly as far along the road as `i`."""
+    rank = tags[RANK, i]
+    while rank > 0 and cars[X, tags[ORDER, rank - 1]] == cars[X, i]:
+        rank -= 1
+    return rank
+
+
+@kernel
+def vehicle_ahead(cars, tags, i, lane):
+    """Return the vehicle next ahead of `i` on `lane` (of several equally far ones the last listed), or -1."""
+    found = -1
+    for rank in range(_first_at(cars, tags, i), cars.shape[1]):
+        j = tags[ORDER, rank]
+        if found >= 0 and cars[X, j] > cars[X, found]:
+            break
+        if j != i and on_lane(cars, j, lane):
+            found = j
+    return found
+
+
+@kernel
+def vehicle_behind(cars, tags, i, lane):
+    """Return the vehicle next behind `i` on `lane` (of several equally far ones the first listed), or -1."""
+    found = -1
+    for rank in range(_first_at(cars, tags, i) - 1, -1, -1):
+        j = tags[ORDER, rank]
+        if found >= 0 and cars[X, j] < cars[X, found]:
+            break
+        if on_lane(cars, j, lane):
+            found = j
+    return found
+
+
+@kernel
+def free_acceleration(cars, i, exponent):
+    """Return IDM's acceleration of vehicle `i` on an empty road, judged with an exponent that may be another's."""
+    wanted = abs(not_zero(clip(cars[TARGET_SPEED, i], 0.0, SPEED_LIMIT)))
+    return COMFORT_ACCELERATION * (1.0 - (max(cars[SPEED, i], 0.0) / wanted) ** exponent)
+
+
+@kernel
+def desired_gap(cars, i, front):
+    """Return the distance that vehicle `i` wants to `front`, between their centres."""
+    closing = (cars[VX, i] - cars[VX, front]) * cars[COS, i] + (cars[VY, i] - cars[VY, front]) * cars[SIN, i]
+    speed = cars[SPEED, i]
+    return GAP_WANTED + speed * TIME_WANTED + speed * closing / TWICE_ROOT
+
+
+@kernel
+def braking(cars, i, front):
+    """Return IDM's deceleration of vehicle `i` because of `front`; 0 where there is none."""
+    if front < 0:
+        return 0.0
+    ratio = desired_gap(cars, i, front) / not_zero(cars[X, front] - cars[X, i])
+    return COMFORT_ACCELERATION * (ratio * ratio)
+
+
+@kernel
+def slip_towards(cars, i, lane):
+    """Return the sine of the slip angle with which vehicle `i` steers to the centre of `lane`."""
+    lateral = cars[Y, i] - LANE_WIDTH * lane
+    heading = cars[HEADING, i]
+    if lateral == 0.0 and heading == 0.0:
+        return 0.0
+    speed = not_zero(cars[SPEED, i])
+    wanted = clip(math.asin(clip(-LATERAL_GAIN * lateral / speed, -1.0, 1.0)), -MAX_HEADING, MAX_HEADING)
+    return clip(HALF_LENGTH / speed * (HEADING_GAIN * wrap_angle(wanted - heading)), -MAX_SLIP, MAX_SLIP)
+
+
+@kernel
+def command_ego(cars, tags, world, action, settings):
+    """Take over a meta-action (an index of ``rapid.scenarios.ACTIONS``): a new target lane or target speed."""
+    if action in (FASTER, SLOWER):
+        index = nearest_speed_index(cars[SPEED, 0], settings.target_speeds) + (1 if action == FASTER else -1)
+        index = min(max(index, 0), len(settings.target_speeds) - 1)
+        world[SPEED_INDEX] = index
+        cars[TARGET_SPEED, 0] = settings.target_speeds[index]
+    elif action in (LANE_LEFT, LANE_RIGHT):
+        lane = tags[TARGET_LANE, 0] + (1 if action == LANE_RIGHT else -1)
+        lane = min(max(lane, 0), settings.lanes - 1)
+        if reachable(cars, 0, lane):
+            tags[TARGET_LANE, 0] = lane
+
+
+@kernel
+def _lane_change_pays(cars, tags, i, lane, free, ahead):
+    """Whether MOBIL lets vehicle `i` change to `lane`; its follower there is judged with the exponent of `i`."""
+    behind = vehicle_behind(cars, tags, i, lane)
+    if behind >= 0:
+        imposed = free_acceleration(cars, behind, cars[EXPONENT, i]) - braking(cars, behind, i)
+        if imposed < -MAX_BRAKING_IMPOSED:
+            return False
+    there = free - braking(cars, i, vehicle_ahead(cars, tags, i, lane))
+    here = free - braking(cars, i, ahead)
+    return there - here >= MIN_GAIN
+
+
+@kernel
+def _give_way(cars, tags, i):
+    """Call off the lane change of vehicle `i` if another one close ahead is changing to the same lane."""
+    target = tags[TARGET_LANE, i]
+    for j in range(cars.shape[1]):
+        if j != i and tags[TARGET_LANE, j] == target and tags[LANE, j] != target:
+            distance = cars[X, j] - cars[X, i]
+            if 0.0 < distance < desired_gap(cars, i, j):
+                tags[TARGET_LANE, i] = tags[LANE, i]
+                return
+
+
+@kernel
+def act(cars, tags, settings):
+    """Let every vehicle choose its command for this frame, in list order: lane choices are seen by those after."""
+    cars[ACCELERATION, 0] = SPEED_GAIN * (cars[TARGET_SPEED, 0] - cars[SPEED, 0])
+    cars[SLIP, 0] = slip_towards(cars, 0, tags[TARGET_LANE, 0])
+    for i in range(1, cars.shape[1]):
+        if tags[CRASHED, i]:
+            continue
+        lane = tags[LANE, i]
+        free = free_acceleration(cars, i, cars[EXPONENT, i])
+        ahead = vehicle_ahead(cars, tags, i, lane)
+        if tags[TARGET_LANE, i] != lane:
+            _give_way(cars, tags, i)
+        elif cars[TIMER, i] > LANE_CHANGE_DELAY:
+            cars[TIMER, i] = 0.0
+            if abs(cars[SPEED, i]) >= 1.0:
+                for side in (lane - 1, lane + 1):
+                    if (
+                        0 <= side < settings.lanes
+                        and reachable(cars, i, side)
+                        and _lane_change_pays(cars, tags, i, side, free, ahead)
+                    ):
+                        tags[TARGET_LANE, i] = side
+        target = tags[TARGET_LANE, i]
+        cars[SLIP, i] = slip_towards(cars, i, target)
+        acceleration = free - braking(cars, i, ahead)
+        if target != lane:
+            acceleration = min(acceleration, free - braking(cars, i, vehicle_ahead(cars, tags, i, target)))
+        cars[ACCELERATION, i] = clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)

@@ -1,0 +1,251 @@
+# pyright: basic
+# Kernels: the types that matter here are numba's, which pyright does not know.
+"""How the vehicles move in a frame and what happens when they touch.
+
+The rules are highway-env's (``vehicle/kinematics.py``, ``vehicle/objects.py``, ``utils.are_polygons_intersecting``).
+"""
+
+import math
+
+import numpy as np
+
+from rapid.simulator.behavior import HALF_LENGTH, ROAD_LENGTH, wrap_angle
+from rapid.simulator.compile import kernel
+from rapid.simulator.spawn import LANE_WIDTH
+from rapid.simulator.state import (
+    ACCELERATION,
+    COS,
+    CRASHED,
+    HEADING,
+    LANE,
+    ORDER,
+    PUSH_X,
+    PUSH_Y,
+    PUSHED,
+    RANK,
+    SIN,
+    SLIP,
+    SPEED,
+    TIMER,
+    VX,
+    VY,
+    X,
+    Y,
+)
+
+TOP_SPEED = 40.0
+HALF_WIDTH = 1.0
+DIAGONAL = math.sqrt(29.0)
+CANDIDATES = 64
+"""Pairs of vehicles close enough to be examined that a frame keeps; beyond that, all pairs are examined."""
+
+
+@kernel
+def _lane_distance(x, y, heading, lane):
+    beyond = max(x - ROAD_LENGTH, 0.0)
+    return abs(y - LANE_WIDTH * lane) + beyond + max(0.0 - x, 0.0) + abs(wrap_angle(heading))
+
+
+@kernel
+def closest_lane(x, y, heading, lane, lanes):
+    """Return the lane nearest to a vehicle that was on `lane`; of two equally near ones the left one."""
+    if abs(y - LANE_WIDTH * lane) < 0.499 * LANE_WIDTH:
+        return lane
+    left = min(max(math.floor(y / LANE_WIDTH), 0), lanes - 1)
+    right = min(left + 1, lanes - 1)
+    return right if _lane_distance(x, y, heading, right) < _lane_distance(x, y, heading, left) else left
+
+
+@kernel
+def move(cars, tags, settings):
+    """Advance every vehicle by one frame with its command; crashed ones brake to a halt."""
+    dt = settings.dt
+    for i in range(cars.shape[1]):
+        cars[TIMER, i] += dt
+        speed = cars[SPEED, i]
+        slip = cars[SLIP, i]
+        acceleration = cars[ACCELERATION, i]
+        if tags[CRASHED, i]:
+            slip = 0.0
+            acceleration = -speed
+        if speed > TOP_SPEED:
+            acceleration = min(acceleration, TOP_SPEED - speed)
+        elif speed < -TOP_SPEED:
+            acceleration = max(acceleration, -TOP_SPEED - speed)
+        straight = slip == 0.0
+        if straight:
+            cars[X, i] += speed * cars[COS, i] * dt
+            cars[Y, i] += speed * cars[SIN, i] * dt
+        else:
+            cos_slip = math.sqrt(1.0 - slip * slip)
+            cars[X, i] += speed * (cars[COS, i] * cos_slip - cars[SIN, i] * slip) * dt
+            cars[Y, i] += speed * (cars[SIN, i] * cos_slip + cars[COS, i] * slip) * dt
+        if tags[PUSHED, i]:
+            cars[X, i] += cars[PUSH_X, i]
+            cars[Y, i] += cars[PUSH_Y, i]
+            tags[CRASHED, i] = 1
+            tags[PUSHED, i] = 0
+        if not straight:
+            cars[HEADING, i] += speed * slip / HALF_LENGTH * dt
+            cars[COS, i] = math.cos(cars[HEADING, i])
+            cars[SIN, i] = math.sin(cars[HEADING, i])
+        speed += acceleration * dt
+        cars[SPEED, i] = speed
+        cars[VX, i] = speed * cars[COS, i]
+        cars[VY, i] = speed * cars[SIN, i]
+        tags[LANE, i] = closest_lane(cars[X, i], cars[Y, i], cars[HEADING, i], tags[LANE, i], settings.lanes)
+
+
+@kernel
+def sort_by_x(cars, tags):
+    """Restore the order by x, ties by list order; vehicles rarely overtake, so insertion sort is linear here."""
+    order = tags[ORDER]
+    for rank in range(1, len(order)):
+        i = order[rank]
+        x = cars[X, i]
+        place = rank
+        while place > 0:
+            j = order[place - 1]
+            if cars[X, j] < x or (cars[X, j] == x and j < i):
+                break
+            order[place] = j
+            place -= 1
+        order[place] = i
+    for rank in range(len(order)):
+        tags[RANK, order[rank]] = rank
+
+
+@kernel
+def _span(cars, i, axis_x, axis_y):
+    """Return the interval that the rectangle of vehicle `i` covers along an axis."""
+    low, high = math.inf, -math.inf
+    cos, sin = cars[COS, i], cars[SIN, i]
+    for corner in range(4):
+        along = HALF_LENGTH if corner >= 2 else -HALF_LENGTH
+        across = HALF_WIDTH if corner == 1 or corner == 2 else -HALF_WIDTH
+        x = cos * along - sin * across + cars[X, i]
+        y = sin * along + cos * across + cars[Y, i]
+        place = x * axis_x + y * axis_y
+        low, high = min(low, place), max(high, place)
+    return low, high
+
+
+@kernel
+def _interval_distance(low_a, high_a, low_b, high_b):
+    return low_b - high_a if low_a < low_b else low_a - high_b
+
+
+@kernel
+def _contact(cars, i, j, dt):
+    """Separating-axis test of two vehicles, as they are and as their velocities displace them within the frame.
+
+    Returns:
+        Whether they intersect, whether they will, and the translation that would part them.
+    """
+    intersect, will_intersect = True, True
+    least, push_x, push_y = math.inf, 0.0, 0.0
+    drift_x, drift_y = (cars[VX, i] - cars[VX, j]) * dt, (cars[VY, i] - cars[VY, j]) * dt
+    apart_x, apart_y = cars[X, i] - cars[X, j], cars[Y, i] - cars[Y, j]
+    for edge in range(8):
+        body = i if edge < 4 else j
+        cos, sin = cars[COS, body], cars[SIN, body]
+        # Normals of the edges in the order of the corners: rear, left, front, right side of the rectangle.
+        side = edge % 4
+        if side == 0:
+            axis_x, axis_y = -cos, -sin
+        elif side == 1:
+            axis_x, axis_y = -sin, cos
+        elif side == 2:
+            axis_x, axis_y = cos, sin
+        else:
+            axis_x, axis_y = sin, -cos
+        low_i, high_i = _span(cars, i, axis_x, axis_y)
+        low_j, high_j = _span(cars, j, axis_x, axis_y)
+        if _interval_distance(low_i, high_i, low_j, high_j) > 0:
+            intersect = False
+        drift = axis_x * drift_x + axis_y * drift_y
+        if drift < 0:
+            low_i += drift
+        else:
+            high_i += drift
+        distance = _interval_distance(low_i, high_i, low_j, high_j)
+        if distance > 0:
+            will_intersect = False
+        if not intersect and not will_intersect:
+            return False, False, 0.0, 0.0
+        if abs(distance) < least:
+            least = abs(distance)
+            sign = 1.0 if apart_x * axis_x + apart_y * axis_y > 0 else -1.0
+            push_x, push_y = sign * axis_x, sign * axis_y
+    return intersect, will_intersect, least * push_x, least * push_y
+
+
+@kernel
+def _may_touch(cars, i, j, dt):
+    """Whether two vehicles need the exact test: a cheap bound that errs on the side of yes."""
+    apart_x, apart_y = cars[X, j] - cars[X, i], cars[Y, j] - cars[Y, i]
+    if math.sqrt(apart_x * apart_x + apart_y * apart_y) > DIAGONAL + cars[SPEED, i] * dt:
+        return False
+    drift_x, drift_y = (cars[VX, i] - cars[VX, j]) * dt, (cars[VY, i] - cars[VY, j]) * dt
+    cos, sin = cars[COS, i], cars[SIN, i]
+    turn_cos = abs(cos * cars[COS, j] + sin * cars[SIN, j])
+    turn_sin = abs(cos * cars[SIN, j] - sin * cars[COS, j])
+    # Apart along one axis of vehicle i, even with the displacement, means apart for the exact test as well.
+    across = abs(cos * apart_y - sin * apart_x) - abs(cos * drift_y - sin * drift_x)
+    if across > 1e-6 + HALF_WIDTH + HALF_LENGTH * turn_sin + HALF_WIDTH * turn_cos:
+        return False
+    along = abs(cos * apart_x + sin * apart_y) - abs(cos * drift_x + sin * drift_y)
+    return along <= 1e-6 + HALF_LENGTH + HALF_LENGTH * turn_cos + HALF_WIDTH * turn_sin
+
+
+@kernel
+def _collide(cars, tags, i, j, dt):
+    """Apply what the contact of `i` and a later listed `j` means; a push takes effect in the next frame."""
+    intersect, will_intersect, push_x, push_y = _contact(cars, i, j, dt)
+    if will_intersect:
+        cars[PUSH_X, i], cars[PUSH_Y, i] = push_x / 2, push_y / 2
+        cars[PUSH_X, j], cars[PUSH_Y, j] = -push_x / 2, -push_y / 2
+        tags[PUSHED, i] = 1
+        tags[PUSHED, j] = 1
+    if intersect:
+        tags[CRASHED, i] = 1
+        tags[CRASHED, j] = 1
+
+
+@kernel
+def collide(cars, tags, settings):
+    """Find and apply all collisions of this frame, pair by pair in list order: later pushes replace earlier ones."""
+    dt = settings.dt
+    vehicles = cars.shape[1]
+    if not settings.all_collide:
+        for j in range(1, vehicles):
+            if _may_touch(cars, 0, j, dt):
+                _collide(cars, tags, 0, j, dt)
+        return
+    reach = 0.0
+    for i in range(vehicles):
+        reach = max(reach, cars[SPEED, i])
+    reach = DIAGONAL + reach * dt
+    order = tags[ORDER]
+    pairs = np.empty(CANDIDATES, np.int64)
+    found = 0
+    for rank in range(vehicles - 1):
+        a = order[rank]
+        for other in range(rank + 1, vehicles):
+            b = order[other]
+            if cars[X, b] - cars[X, a] > reach:
+                break
+            i, j = min(a, b), max(a, b)
+            if _may_touch(cars, i, j, dt):
+                if found < CANDIDATES:
+                    pairs[found] = i * vehicles + j
+                found += 1
+    if found > CANDIDATES:
+        for i in range(vehicles):
+            for j in range(i + 1, vehicles):
+                if _may_touch(cars, i, j, dt):
+                    _collide(cars, tags, i, j, dt)
+    else:
+        pairs[:found].sort()
+        for k in range(found):
+            _collide(cars, tags, pairs[k] // vehicles, pairs[k] % vehicles, dt)

@@ -1,0 +1,218 @@
+"""One compiled world as a Gymnasium environment."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, SupportsInt, cast
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rapid.errors import RapidError
+from rapid.scenarios import ACTIONS, Scenario, get_scenario
+from rapid.simulator.observation import (
+    INFO_COLLISION,
+    INFO_CRASHED,
+    INFO_DISTANCE,
+    INFO_FAST,
+    INFO_LANE,
+    INFO_ON_ROAD,
+    INFO_RIGHT,
+    INFO_SPEED,
+)
+from rapid.simulator.settings import Settings, merge_config, read_settings
+from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
+from rapid.simulator.step import (
+    CONTINUE,
+    allocate_outputs,
+    forecast_worlds,
+    reset_worlds,
+    step_worlds,
+)
+from rapid.simulator.stream import set_generator, stream_of
+
+
+class Forecast(NamedTuple):
+    """What T actions would lead to. With one world the arrays start at T, with several at (M, T)."""
+
+    observations: NDArray[np.float32]
+    """(T, V, F)"""
+    rewards: NDArray[np.float64]
+    """(T,)"""
+    terminated: NDArray[np.bool_]
+    """(T,)"""
+    truncated: NDArray[np.bool_]
+    """(T,)"""
+
+
+class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
+    """highway-env's ``HighwayEnv``, compiled: same spawns, decisions and rewards, states equal up to rounding.
+
+    ``info`` holds ``speed`` [m/s], ``lane``, ``distance`` [m since reset], ``crashed`` and ``rewards`` (the terms).
+    As in highway-env, a step after the end of an episode drives on.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium declares it mutable
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "lane-3-density-2",
+        render_mode: str | None = None,
+        config: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Prepare the environment; the first traffic comes with ``reset``.
+
+        Args:
+            scenario: a name such as ``lane-3-density-2``, or a :class:`~rapid.scenarios.Scenario`.
+            render_mode: None; the compiled simulator draws nothing.
+            config: keys of highway-env's configuration to override.
+
+        Raises:
+            RapidError: an unknown scenario, a configuration that the compiled simulator does not cover, or a
+                render mode.
+        """
+        if render_mode is not None:
+            raise RapidError(
+                f"The compiled simulator has no render mode {render_mode!r}; make the environment with "
+                'simulator="highway-env" to draw it.'
+            )
+        self.scenario = get_scenario(scenario) if isinstance(scenario, str) else scenario
+        self.config = merge_config(self.scenario.config(), config)
+        self.render_mode = None
+        self.settings = read_settings(self.config, self.scenario.dynamics)
+        self.observation_space, self.action_space = spaces_of(self.settings)
+        self.state: State = allocate(1, self.settings)
+        self._out = allocate_outputs(1, self.settings)
+        self._ready = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode: the one that highway-env begins for `seed`, or, without one, the next of this stream.
+
+        Raises:
+            RapidError: any option is given; there is none to give.
+        """
+        if options:
+            raise RapidError(
+                f"reset() of the compiled simulator takes no options, got {sorted(options)}. To change the "
+                "configuration, make another environment with config={...}."
+            )
+        super().reset(seed=seed)
+        self.state.stream[0] = stream_of(self.np_random)
+        reset_worlds(self.state, np.ones(1, np.bool_), self.settings, self._out)
+        set_generator(self.np_random, self.state.stream[0])
+        self._ready = True
+        return self._out.observations[0].copy(), info_of(self._out.info[0])
+
+    def step(self, action: SupportsInt) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Take one decision and let its seconds pass.
+
+        Returns:
+            observation float32 (V, F), reward, terminated (crashed), truncated (time is up), info.
+
+        Raises:
+            RapidError: no episode has begun, or the action is not one of the action space.
+        """
+        self._require_reset()
+        actions = check_actions(action, self.settings, ())
+        out = self._out
+        step_worlds(self.state, actions.reshape(1), self.settings, CONTINUE, out)
+        return (
+            out.observations[0].copy(),
+            float(out.rewards[0]),
+            bool(out.terminated[0]),
+            bool(out.truncated[0]),
+            info_of(out.info[0]),
+        )
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the whole world, its random stream included.
+
+        Raises:
+            RapidError: no episode has begun.
+        """
+        self._require_reset()
+        self.state.stream[0] = stream_of(self.np_random)
+        return snapshot(self.state, 0)
+
+    def restore(self, snap: Snapshot) -> None:
+        """Put the world back as it was at a snapshot of an environment of this scenario.
+
+        Raises:
+            RapidError: the snapshot comes from another kind of world.
+        """
+        restore(self.state, 0, snap)
+        set_generator(self.np_random, self.state.stream[0])
+        self._ready = True
+
+    def forecast(self, actions: Sequence[int] | NDArray[np.integer]) -> Forecast:
+        """Return what T actions would lead to, without touching this world; it drives on after an end.
+
+        Raises:
+            RapidError: no episode has begun, or an action is not one of the action space.
+        """
+        self._require_reset()
+        chosen = check_actions(actions, self.settings, (None,))
+        several = forecast(self.state.copy(), chosen.reshape(1, -1), self.settings)
+        return Forecast(*(array[0] for array in several))
+
+    def _require_reset(self) -> None:
+        if not self._ready:
+            raise RapidError("No episode has begun. Call reset() first.")
+
+
+def spaces_of(settings: Settings) -> tuple["gymnasium.Space[NDArray[np.float32]]", "gymnasium.Space[np.int64]"]:
+    """Return the observation and the action space of one world, equal to highway-env's."""
+    shape = (settings.rows, len(settings.features))
+    box = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+    return cast("gymnasium.Space[NDArray[np.float32]]", box), gymnasium.spaces.Discrete(len(settings.actions))
+
+
+def check_actions(actions: Any, settings: Settings, shape: tuple[int | None, ...]) -> NDArray[np.int64]:
+    """Return actions as an int64 array of the given shape (None: any length).
+
+    Raises:
+        RapidError: they are not whole numbers, have another shape or lie outside the action space.
+    """
+    array = np.asarray(actions)
+    if array.dtype.kind not in "iu":
+        raise RapidError(f"Actions must be whole numbers; got {array.dtype} ({actions!r:.60}). Convert them to int.")
+    if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True)):
+        wanted = str(tuple("any" if length is None else length for length in shape)).replace("'", "")
+        raise RapidError(f"Actions must have the shape {wanted}, one per world and decision; got {array.shape}.")
+    count = len(settings.actions)
+    if array.size and (array.min() < 0 or array.max() >= count):
+        wrong = array[(array < 0) | (array >= count)].flat[0]
+        named = ", ".join(f"{i} {ACTIONS[meta]}" for i, meta in enumerate(settings.actions))
+        raise RapidError(f"Unknown action {wrong}; expected one of: {named}.")
+    return np.ascontiguousarray(array, np.int64)
+
+
+def info_of(info: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the info dict of one world from its row of INFO_COLUMNS numbers."""
+    values = info.tolist()
+    return {
+        "speed": values[INFO_SPEED],
+        "lane": int(values[INFO_LANE]),
+        "distance": values[INFO_DISTANCE],
+        "crashed": values[INFO_CRASHED] != 0.0,
+        "rewards": {
+            "collision_reward": values[INFO_COLLISION],
+            "right_lane_reward": values[INFO_RIGHT],
+            "high_speed_reward": values[INFO_FAST],
+            "on_road_reward": values[INFO_ON_ROAD],
+        },
+    }
+
+
+def forecast(state: State, actions: NDArray[np.int64], settings: Settings) -> Forecast:
+    """Drive M worlds through (M, T) checked actions; the worlds are changed, so pass copies."""
+    shape = actions.shape
+    result = Forecast(
+        np.empty((*shape, settings.rows, len(settings.features)), np.float32),
+        np.empty(shape),
+        np.empty(shape, np.bool_),
+        np.empty(shape, np.bool_),
+    )
+    forecast_worlds(state, actions, settings, *result)
+    return result

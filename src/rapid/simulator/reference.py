@@ -1,0 +1,131 @@
+"""highway-env itself behind the same interface: what the compiled simulator is proven against and falls back to."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from rapid.errors import RapidError
+from rapid.scenarios import Scenario, get_scenario
+from rapid.simulator.settings import merge_config, read_integer
+
+
+class ReferenceHighwayEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """``highway-v0`` or ``highway-fast-v0`` with the info of the compiled simulator.
+
+    ``info["action"]`` is left out: at reset highway-env fills it with an unseeded sample.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._start = 0.0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._start = float(self._ego.position[0])
+        return observation, self._info(info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take one decision."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, float(reward), bool(terminated), bool(truncated), self._info(info)
+
+    @property
+    def _ego(self) -> Any:
+        highway: Any = self.env.unwrapped
+        return highway.vehicle
+
+    def _info(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "speed": float(info["speed"]),
+            "lane": int(self._ego.lane_index[2]),
+            "distance": float(self._ego.position[0]) - self._start,
+            "crashed": bool(info["crashed"]),
+            "rewards": {name: float(value) for name, value in info["rewards"].items()},
+        }
+
+
+class _StandStill(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Keep an ended world as it is, with a reward of 0, until it is reset."""
+
+    _last: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._last = None
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self._last is not None:
+            observation, terminated, truncated, info = self._last
+            return observation, 0.0, terminated, truncated, info
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
+            self._last = observation, terminated, truncated, info
+        return observation, float(reward), terminated, truncated, info
+
+
+class ReferenceVectorEnv(SyncVectorEnv[Any, Any]):
+    """Worlds of highway-env, stepped one after the other, with the interface of ``CompiledVectorEnv``."""
+
+    def __init__(
+        self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], seed: int | None, autoreset: bool
+    ) -> None:
+        mode = AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED
+        super().__init__(env_fns, autoreset_mode=mode)
+        self._first_seed = seed
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in every world."""
+        if seed is None:
+            seed = self._first_seed
+        self._first_seed = None
+        return super().reset(seed=seed, options=options)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Take one decision in every world."""
+        if self.autoreset_mode == AutoresetMode.DISABLED:
+            self._autoreset_envs[:] = False  # ended worlds stand still instead of being an error
+        return super().step(actions)
+
+
+def make_reference_env(
+    scenario: str | Scenario, render_mode: str | None = None, config: Mapping[str, Any] | None = None
+) -> gymnasium.Env[Any, Any]:
+    """Return highway-env's own environment for a scenario.
+
+    Raises:
+        RapidError: an unknown scenario, or highway-env is not installed.
+    """
+    chosen = get_scenario(scenario) if isinstance(scenario, str) else scenario
+    try:
+        import highway_env  # noqa: F401 - registers the ids  # pyright: ignore[reportUnusedImport]
+    except ImportError as error:
+        raise RapidError("highway-env is not installed. Run: pip install highway-env") from error
+    made = gymnasium.make(
+        chosen.env_id,
+        render_mode=render_mode,
+        config=merge_config(chosen.config(), config),
+        disable_env_checker=True,  # it would step and reset once more, at highway-env's price
+    )
+    return ReferenceHighwayEnv(made)
+
+
+def make_reference_vec(
+    scenario: str | Scenario,
+    num_envs: int,
+    seed: int | None = None,
+    config: Mapping[str, Any] | None = None,
+    autoreset: bool = True,
+) -> ReferenceVectorEnv:
+    """Return `num_envs` environments of highway-env as one vector environment."""
+    count = read_integer({"num_envs": num_envs}, "num_envs", 1, 1_000_000)
+
+    def make() -> gymnasium.Env[Any, Any]:
+        env = make_reference_env(scenario, None, config)
+        return env if autoreset else _StandStill(env)
+
+    return ReferenceVectorEnv([make] * count, seed, autoreset)

@@ -1,0 +1,258 @@
+"""Many compiled worlds as one Gymnasium vector environment: one compiled call steps them all, resets included."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from rapid.errors import RapidError
+from rapid.scenarios import Scenario, get_scenario
+from rapid.simulator.env import Forecast, check_actions, forecast, spaces_of
+from rapid.simulator.observation import (
+    INFO_COLLISION,
+    INFO_CRASHED,
+    INFO_DISTANCE,
+    INFO_FAST,
+    INFO_LANE,
+    INFO_ON_ROAD,
+    INFO_RIGHT,
+    INFO_SPEED,
+)
+from rapid.simulator.settings import merge_config, read_integer, read_settings
+from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
+from rapid.simulator.step import AUTORESET, FREEZE, allocate_outputs, reset_worlds, seed_worlds, step_worlds
+from rapid.simulator.stream import stream_of
+
+Mask = NDArray[np.bool_]
+
+
+class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
+    """B compiled worlds. With ``autoreset`` (SAME_STEP) an ended episode is followed by the next in the same step.
+
+    A step returns observations float32 (B, V, F), rewards float64 (B,), terminated and truncated bool (B,), and
+    ``info`` with the arrays ``speed`` [m/s], ``lane``, ``distance`` [m since reset], ``crashed`` and the dict
+    ``rewards`` of the terms. Where a world was reset, these describe its new episode, ``final_obs`` (an object array,
+    None elsewhere) holds the last observation of the old one and ``final_info`` its info. Every entry has a mask with
+    a leading underscore, as Gymnasium defines it.
+
+    Without ``autoreset`` an ended world stands still: it keeps its observation and flags and earns 0, until it is
+    chosen by ``reset(options={"reset_mask": mask})`` or everything is reset.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Scenario,
+        num_envs: int,
+        seed: int | None = None,
+        config: Mapping[str, Any] | None = None,
+        autoreset: bool = True,
+    ) -> None:
+        """Prepare the worlds; the first traffic comes with ``reset``.
+
+        Args:
+            scenario: a name such as ``lane-3-density-2``, or a :class:`~rapid.scenarios.Scenario`.
+            num_envs: B.
+            seed: seeds the first ``reset()`` that is called without one.
+            config: keys of highway-env's configuration to override.
+            autoreset: whether an ended world begins its next episode within the same step.
+
+        Raises:
+            RapidError: an unknown scenario, a configuration that the compiled simulator does not cover, or no worlds.
+        """
+        self.scenario = get_scenario(scenario) if isinstance(scenario, str) else scenario
+        self.config = merge_config(self.scenario.config(), config)
+        self.settings = read_settings(self.config, self.scenario.dynamics)
+        self.num_envs = read_integer({"num_envs": num_envs}, "num_envs", 1, 1_000_000)
+        self.render_mode = None
+        self._mode = AUTORESET if autoreset else FREEZE
+        self.metadata = {
+            "render_modes": [],
+            "autoreset_mode": AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED,
+        }
+        self.single_observation_space, self.single_action_space = spaces_of(self.settings)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.state: State = allocate(self.num_envs, self.settings)
+        self._first_seed = seed
+        self._seeded = np.zeros(self.num_envs, np.bool_)
+        self._ready = np.zeros(self.num_envs, np.bool_)
+        self._observations = np.zeros((self.num_envs, self.settings.rows, len(self.settings.features)), np.float32)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode in every world, or in those of ``options["reset_mask"]`` (bool, (B,)).
+
+        Args:
+            seed: with a whole number, world i is seeded with ``seed + i``; with a list, each world with its own.
+                Without one, or where the list says None, the world's stream goes on.
+            options: ``{"reset_mask": mask}`` or nothing.
+
+        Raises:
+            RapidError: a seed below 0, a list or a mask of another length, or an unknown option.
+        """
+        chosen = self._chosen(options)
+        if seed is None and self._first_seed is not None:
+            seed = self._first_seed
+        self._first_seed = None
+        self._seed(seed, chosen)
+        out = allocate_outputs(self.num_envs, self.settings)
+        out.observations[:] = self._observations
+        reset_worlds(self.state, chosen, self.settings, out)
+        self._ready |= chosen
+        self._observations = out.observations
+        return out.observations.copy(), _info(out.info, chosen)
+
+    def step(
+        self, actions: NDArray[np.integer] | Sequence[int]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], Mask, Mask, dict[str, Any]]:
+        """Take one decision in every world and let its seconds pass.
+
+        Raises:
+            RapidError: a world has not begun, or actions of another shape, type or range than the action space.
+        """
+        self._require_reset()
+        checked = check_actions(actions, self.settings, (self.num_envs,))
+        out = allocate_outputs(self.num_envs, self.settings)
+        step_worlds(self.state, checked, self.settings, self._mode, out)
+        info: dict[str, Any] = {}
+        ended = out.terminated | out.truncated
+        if self._mode == AUTORESET and ended.any():
+            finals = np.full(self.num_envs, None, object)
+            for i in np.flatnonzero(ended):  # Gymnasium wants an array of arrays; only the worlds that just ended
+                finals[i] = out.final_observations[i]
+            info = {
+                "final_obs": finals,
+                "_final_obs": ended.copy(),
+                "final_info": _info(out.final_info, ended),
+                "_final_info": ended.copy(),
+            }
+        info |= _info(out.info, np.ones(self.num_envs, np.bool_))
+        self._observations = out.observations
+        return out.observations.copy(), out.rewards, out.terminated, out.truncated, info
+
+    def snapshot(self, index: int) -> Snapshot:
+        """Return a copy of one world, its random stream included.
+
+        Raises:
+            RapidError: no such world, or it has not begun.
+        """
+        self._check_index(index)
+        self._require_reset()
+        return snapshot(self.state, index)
+
+    def restore(self, index: int, snap: Snapshot) -> None:
+        """Put one world back as it was at a snapshot of a world of this scenario.
+
+        Raises:
+            RapidError: no such world, or the snapshot comes from another kind of world.
+        """
+        self._check_index(index)
+        restore(self.state, index, snap)
+        self._seeded[index] = self._ready[index] = True
+
+    def forecast(
+        self, actions: NDArray[np.integer] | Sequence[Sequence[int]], worlds: Sequence[int] | None = None
+    ) -> Forecast:
+        """Return what (M, T) actions would lead to, without touching the worlds; they drive on after an end.
+
+        Args:
+            actions: one row of T actions for each world to look ahead from.
+            worlds: the world of each row, any number of times each; None: every world once.
+
+        Raises:
+            RapidError: a world has not begun, no such world, or actions of another shape, type or range.
+        """
+        self._require_reset()
+        chosen = list(range(self.num_envs)) if worlds is None else list(worlds)
+        for index in chosen:
+            self._check_index(index)
+        checked = check_actions(actions, self.settings, (len(chosen), None))
+        return forecast(self.state.take(chosen), checked, self.settings)
+
+    def _seed(self, seed: int | Sequence[int | None] | None, chosen: Mask) -> None:
+        if seed is None:
+            seeds: list[int | None] = [None] * self.num_envs
+        elif isinstance(seed, (int, np.integer)):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise RapidError(f"A list of seeds needs one per world, {self.num_envs}; got {len(seeds)}.")
+        for value in seeds:
+            if value is not None and (not isinstance(cast(Any, value), (int, np.integer)) or value < 0):
+                raise RapidError(f"Seeds must be whole numbers of at least 0; got {value!r}.")
+        given = np.array([value is not None for value in seeds]) & chosen
+        fresh = ~given & ~self._seeded & chosen
+        words = np.zeros(self.num_envs, np.uint64)
+        words[fresh] = np.random.SeedSequence().generate_state(self.num_envs, np.uint64)[fresh]
+        words[given] = [value % (1 << 64) for value, use in zip(seeds, given, strict=True) if use and value is not None]
+        seed_worlds(self.state, given | fresh, words)
+        for i in np.flatnonzero(given):
+            value = seeds[i]
+            if value is not None and value >= 1 << 64:  # the compiled seeding takes 64 bits
+                self.state.stream[i] = stream_of(np.random.Generator(np.random.PCG64(value)))
+        self._seeded |= chosen
+
+    def _chosen(self, options: dict[str, Any] | None) -> Mask:
+        unknown = sorted(set(options or {}) - {"reset_mask"})
+        if unknown:
+            raise RapidError(
+                f"reset() of the compiled simulator takes the option 'reset_mask' only, got {unknown}. To change the "
+                "configuration, make another environment with config={...}."
+            )
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            return np.ones(self.num_envs, np.bool_)
+        array = np.asarray(mask)
+        if array.dtype != np.bool_ or array.shape != (self.num_envs,) or not array.any():
+            raise RapidError(
+                f"reset_mask must be a bool array of shape ({self.num_envs},) with at least one True; got "
+                f"{array.dtype} of shape {array.shape}."
+            )
+        return array.copy()
+
+    def _check_index(self, index: int) -> None:
+        if not 0 <= index < self.num_envs:
+            raise RapidError(f"There is no world {index}; expected 0 to {self.num_envs - 1}.")
+
+    def _require_reset(self) -> None:
+        if not self._ready.all():
+            raise RapidError("No episode has begun in some worlds. Call reset() first.")
+
+
+def _info(info: NDArray[np.float64], mask: Mask) -> dict[str, Any]:
+    """Return the (B, INFO_COLUMNS) numbers as Gymnasium's vector info, valid where `mask` holds and zero elsewhere."""
+    columns = np.where(mask[:, None], info, 0.0).T
+
+    def masked(entries: dict[str, Any]) -> dict[str, Any]:
+        result: dict[str, Any] = {}
+        for key, value in entries.items():
+            result[key] = value
+            result["_" + key] = mask.copy()
+        return result
+
+    terms = masked(
+        {
+            "collision_reward": columns[INFO_COLLISION],
+            "right_lane_reward": columns[INFO_RIGHT],
+            "high_speed_reward": columns[INFO_FAST],
+            "on_road_reward": columns[INFO_ON_ROAD],
+        }
+    )
+    return masked(
+        {
+            "speed": columns[INFO_SPEED],
+            "lane": columns[INFO_LANE].astype(np.int64),
+            "distance": columns[INFO_DISTANCE],
+            "crashed": columns[INFO_CRASHED] != 0.0,
+            "rewards": terms,
+        }
+    )
