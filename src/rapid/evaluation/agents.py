@@ -1,0 +1,111 @@
+"""One way to ask all that can drive: agents, teachers that hear their last decision, planners in the world."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+import rapid
+from rapid.errors import RapidError, did_you_mean
+from rapid.scenarios import get_scenario
+from rapid.seeding import stream_seed
+
+Said = tuple[NDArray[np.float32] | None, str]
+"""The values of the actions, if the driver has any, and its words, if it says any."""
+
+
+class Driver(Protocol):
+    """Whoever drives B worlds; only those in `worlds` are still under way."""
+
+    def choose(
+        self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64], seed_B: NDArray[np.int64], step: int
+    ) -> NDArray[np.int64]:
+        """Return one action for each of `worlds`, in their order."""
+        ...
+
+    def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
+        """Return what there is to say about the choice just made, for each of `worlds`."""
+        ...
+
+
+def open_agent(spec: str, scenario: str, seed: int = 0) -> Any:
+    """Return the agent that `spec` names: a directory of a trained agent, or a scripted driver's name.
+
+    `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are.
+
+    Raises:
+        RapidError: `spec` is neither.
+    """
+    from rapid.teacher.scripted import SCRIPTED, Scripted
+
+    if spec in SCRIPTED:
+        return Scripted(spec, get_scenario(scenario).lanes, seed)
+    if Path(spec).is_dir():
+        return rapid.load_agent(spec)
+    raise RapidError(
+        f"There is no agent '{spec}'{did_you_mean(spec, SCRIPTED)} Give the directory of an agent that `rapid distill` "
+        f"or `rapid adapt` wrote, or a scripted driver: {', '.join(SCRIPTED)}."
+    )
+
+
+def driver_for(agent: Any, env: Any, generator_seed: int) -> Driver:
+    """Return the driver that asks `agent`; `env` is for agents that need the worlds themselves.
+
+    Raises:
+        RapidError: `agent` is nothing that can drive.
+    """
+    if callable(getattr(agent, "bind", None)):
+        return _AgentDriver(agent.bind(env), everywhere=True)
+    if callable(getattr(agent, "act", None)):
+        return _AgentDriver(agent, everywhere=False)
+    if callable(getattr(agent, "decide", None)):
+        return _TeacherDriver(agent, generator_seed)
+    raise RapidError(
+        f"{type(agent).__name__} cannot drive. Expected an agent with act(obs_BVF), a teacher with decide(...), or an "
+        "agent with bind(env)."
+    )
+
+
+class _AgentDriver:
+    """An agent with ``act``; one that was bound to the worlds gets all of them, so that its rows are theirs."""
+
+    def __init__(self, agent: Any, everywhere: bool) -> None:
+        self._agent, self._everywhere = agent, everywhere
+
+    def choose(
+        self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64], seed_B: NDArray[np.int64], step: int
+    ) -> NDArray[np.int64]:
+        if self._everywhere:
+            return np.asarray(self._agent.act(seen_BVF), np.int64)[worlds]
+        return np.asarray(self._agent.act(seen_BVF[worlds]), np.int64)
+
+    def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
+        values = getattr(self._agent, "q_values", None)
+        if not callable(values):
+            return [(None, "")] * len(worlds)
+        q_BA = np.asarray(values(seen_BVF if self._everywhere else seen_BVF[worlds]), np.float32)
+        return [(q_A, "") for q_A in (q_BA[worlds] if self._everywhere else q_BA)]
+
+
+class _TeacherDriver:
+    """A teacher, asked for the worlds under way only; it gets its own last decision of each world."""
+
+    def __init__(self, teacher: Any, generator_seed: int) -> None:
+        self._teacher, self._seed = teacher, generator_seed
+        self._previous: dict[int, Any] = {}
+
+    def choose(
+        self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64], seed_B: NDArray[np.int64], step: int
+    ) -> NDArray[np.int64]:
+        # A key names one decision, whatever else is asked beside it, so that a driver's chance does not depend on that.
+        keys = [stream_seed(self._seed, f"decision/{seed_B[world]}/{step}") for world in worlds]
+        previous = [self._previous.get(int(world)) for world in worlds]
+        decisions = self._teacher.decide(seen_BVF[worlds], previous, np.array(keys, np.int64))
+        for world, decision in zip(worlds, decisions, strict=True):
+            self._previous[int(world)] = decision
+        return np.array([int(decision.action) for decision in decisions], np.int64)
+
+    def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
+        return [(None, str(getattr(self._previous[int(world)], "explanation", "") or "")) for world in worlds]

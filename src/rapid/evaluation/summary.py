@@ -1,0 +1,232 @@
+"""From episode rows to a table: one line per agent and scenario, every number with its interval."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rapid.evaluation.metrics import EpisodeRow, column
+from rapid.evaluation.statistics import ENOUGH_SEEDS, RESAMPLES, Estimate, estimate
+from rapid.scenarios import ACTIONS
+
+Kind = Literal["floor", "teacher", "planner", "learned"]
+KINDS: dict[Kind, str] = {
+    "floor": "needs no learning",
+    "teacher": "the teacher",
+    "planner": "search with a perfect model",
+    "learned": "learned",
+}
+"""Kinds of agents in the order of the table. All but `learned` are there for reference."""
+
+NOT_APPLICABLE = "n/a"
+NOT_RUN = "–"
+
+_FLOORS = {
+    "slower": "always-slower",
+    "idle": "always-idle",
+    "faster": "always-faster",
+    "random": "random",
+    "uniform-safe": "random among safe",
+    "rule": "rule",
+    "rule-forecast": "rule, forecast",
+}
+
+CLEAN = "none"
+METRICS: tuple[str, ...] = (
+    "episode_return",
+    "crashed",
+    "mean_speed",
+    "distance",
+    "lane_changes",
+    "min_ttc",
+    "decision_ms",
+)
+
+
+@dataclass(frozen=True)
+class AttackCell:
+    """What an attack left of an agent; `missing` says why there is nothing."""
+
+    episode_return: Estimate | None
+    crashed: Estimate | None
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class SummaryRow:
+    """One agent in one scenario."""
+
+    scenario: str
+    agent: str
+    label: str
+    """The agent's name as shown."""
+    kind: Kind
+    metrics: dict[str, Estimate]
+    """Without attack, by the name in :data:`METRICS`, and `iqm`, the interquartile mean of the return."""
+    shares: tuple[float, ...]
+    """Mean share of each action, without attack."""
+    attacks: dict[str, AttackCell]
+    """By name, without `none`, in the order of first appearance in the rows."""
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether the row is there to compare with and was not trained."""
+        return self.kind != "learned"
+
+
+def kind_of(agent: str) -> Kind:
+    """Return what kind of agent goes by this name."""
+    if agent in _FLOORS or agent in _FLOORS.values():
+        return "floor"
+    word = agent.split("-")[0].split(":")[0].split(" ")[0].lower()
+    return "teacher" if word == "teacher" else "planner" if word == "planner" else "learned"
+
+
+def label_of(agent: str) -> str:
+    """Return an agent's name as shown: ``slower`` is ``always-slower``."""
+    return _FLOORS.get(agent, agent)
+
+
+def summarize(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[SummaryRow]:
+    """Return one summary per scenario and agent: floors, teacher, planner, then what was learned, as they came."""
+    groups: dict[tuple[str, str], dict[str, list[EpisodeRow]]] = {}
+    gradient: dict[str, bool] = {}
+    for row in rows:
+        groups.setdefault((row.scenario, row.agent), {}).setdefault(row.attack, []).append(row)
+        gradient[row.attack] = gradient.get(row.attack, False) or row.gradient_attack
+    gradient.pop(CLEAN, None)
+    scenarios = list(dict.fromkeys(row.scenario for row in rows))
+    order = list(KINDS)
+    summaries = [
+        SummaryRow(
+            scenario=scenario,
+            agent=agent,
+            label=label_of(agent),
+            kind=kind_of(agent),
+            metrics=_metrics(by_attack.get(CLEAN, []), resamples),
+            shares=_shares(by_attack.get(CLEAN, [])),
+            attacks={name: _cell(by_attack, name, needs, resamples) for name, needs in gradient.items()},
+        )
+        for (scenario, agent), by_attack in groups.items()
+    ]
+    return sorted(summaries, key=lambda row: (scenarios.index(row.scenario), order.index(row.kind)))
+
+
+def _estimate(rows: Sequence[EpisodeRow], name: str, resamples: int, iqm: bool = False) -> Estimate:
+    return estimate(
+        column(rows, name),
+        [row.seed for row in rows],
+        [row.training_seed for row in rows],
+        "iqm" if iqm else "mean",
+        resamples,
+    )
+
+
+def _metrics(rows: Sequence[EpisodeRow], resamples: int) -> dict[str, Estimate]:
+    found = {name: _estimate(rows, name, resamples) for name in METRICS}
+    found["iqm"] = _estimate(rows, "episode_return", resamples, iqm=True)
+    return found
+
+
+def _shares(rows: Sequence[EpisodeRow]) -> tuple[float, ...]:
+    """Return the mean share of each action; every episode counts alike."""
+    if not rows:
+        return (math.nan,) * len(ACTIONS)
+    return tuple(sum(row.shares[i] for row in rows) / len(rows) for i in range(len(ACTIONS)))
+
+
+def _cell(by_attack: dict[str, list[EpisodeRow]], name: str, needs_gradient: bool, resamples: int) -> AttackCell:
+    rows = by_attack.get(name, [])
+    if rows:
+        return AttackCell(_estimate(rows, "episode_return", resamples), _estimate(rows, "crashed", resamples))
+    has_network = any(row.has_network for of in by_attack.values() for row in of)
+    return AttackCell(None, None, NOT_APPLICABLE if needs_gradient and not has_network else NOT_RUN)
+
+
+def number(value: float, digits: int = 1, scale: float = 1.0) -> str:
+    """Return a number as shown; NaN is a dash."""
+    return NOT_RUN if math.isnan(value) else f"{value * scale:.{digits}f}"
+
+
+def with_interval(of: Estimate, digits: int = 1, scale: float = 1.0) -> str:
+    """Return ``value [low, high]``, or the value alone where there is no interval."""
+    if math.isnan(of.low):
+        return number(of.value, digits, scale)
+    return f"{number(of.value, digits, scale)} [{number(of.low, digits, scale)}, {number(of.high, digits, scale)}]"
+
+
+def units(rows: Sequence[SummaryRow]) -> str:
+    """Return one sentence on what the intervals are over, and what they say nothing about."""
+    learned = [row.metrics["episode_return"] for row in rows if row.kind == "learned"]
+    trainings = {of.training_seeds for of in learned if of.training_seeds}
+    counts = sorted({row.metrics["episode_return"].spawns for row in rows})
+    spawns = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else f"{counts[0]}" if counts else "no"
+    sentence = f"Means with 95 % bootstrap intervals over {spawns} spawn seeds"
+    if trainings == {1}:
+        return (
+            f"{sentence}. Learned rows are one training each: their intervals cover the traffic, not what another "
+            "training would give."
+        )
+    if trainings and max(trainings) > 1:
+        few = min(trainings) < ENOUGH_SEEDS
+        fewness = f" Fewer than {ENOUGH_SEEDS} trainings: preliminary." if few else ""
+        return f"{sentence}, and over training seeds where there are several ({_span(trainings)}).{fewness}"
+    return f"{sentence}."
+
+
+def _span(counts: set[int]) -> str:
+    low, high = min(counts), max(counts)
+    return str(high) if low == high else f"{low} to {high}"
+
+
+def summary_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
+    """Return the summary as aligned plain text: first without attack, then the return under each attack."""
+    if not rows:
+        return "Nothing was measured: there are no episodes."
+    summaries = summarize(rows, resamples)
+    blocks: list[str] = []
+    for scenario in dict.fromkeys(row.scenario for row in summaries):
+        here = [row for row in summaries if row.scenario == scenario]
+        blocks.append(f"{scenario}\n{_table(_clean_cells(here))}")
+        if any(row.attacks for row in here):
+            names = list(here[0].attacks)
+            lines = [["return under attack", "none", *names]]
+            lines += [[row.label, number(row.metrics["episode_return"].value), *_attack_texts(row)] for row in here]
+            blocks.append(_table(lines))
+    if any(cell.missing == NOT_APPLICABLE for row in summaries for cell in row.attacks.values()):
+        blocks.append(f"{NOT_APPLICABLE}: a gradient attack needs a network, and this agent has none.")
+    blocks.append(units(summaries))
+    return "\n\n".join(blocks)
+
+
+def _attack_texts(row: SummaryRow) -> list[str]:
+    return [
+        cell.missing if cell.episode_return is None else with_interval(cell.episode_return)
+        for cell in row.attacks.values()
+    ]
+
+
+def _clean_cells(rows: Sequence[SummaryRow]) -> list[list[str]]:
+    short = "/".join(name.removeprefix("LANE_")[0].lower() for name in ACTIONS)
+    lines = [["agent", "return", "IQM", "crash %", "speed m/s", "distance m", f"actions % {short}"]]
+    for row in rows:
+        of = row.metrics
+        lines.append(
+            [
+                row.label,
+                with_interval(of["episode_return"]),
+                number(of["iqm"].value),
+                with_interval(of["crashed"], 0, 100),
+                with_interval(of["mean_speed"]),
+                number(of["distance"].value, 0),
+                "/".join(number(share, 0, 100) for share in row.shares),
+            ]
+        )
+    return lines
+
+
+def _table(lines: Sequence[Sequence[str]]) -> str:
+    """Return the lines aligned, names to the left, a rule under the head."""
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    text = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+    return "\n".join([text[0], "  ".join("-" * width for width in widths), *text[1:]])
