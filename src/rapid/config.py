@@ -127,7 +127,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class RobustConfig:
-    """The inner maximisation of the robust term (paper: equation 4), in features scaled to +-1."""
+    """The inner maximisation of the robust term (paper: equation 5), in features scaled to +-1."""
 
     norm: Literal["l2", "linf"] = "linf"
     """Norm of the ball."""
@@ -145,7 +145,7 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """The training loss: TD + conservative + robust (paper: equations 2 to 4)."""
+    """The training loss: TD + conservative + robust (paper: equations 2 to 5)."""
 
     discount: float = 0.95
     """gamma"""

@@ -1,0 +1,182 @@
+"""Agents: what drives. And agents on disk: weights as safetensors, the rest as JSON, nothing that runs code."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from rapid import files
+from rapid.config import NetworkConfig, apply_overrides
+from rapid.errors import RapidError
+from rapid.networks.q_network import Explanation, QNetwork, build_network
+from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
+
+FORMAT = "rapid-agent"
+VERSION = 1
+CONFIG_FILE = "config.json"
+WEIGHTS_FILE = "weights.safetensors"
+
+
+class Agent(Protocol):
+    """Anything that chooses actions from observations."""
+
+    @property
+    def name(self) -> str:
+        """The name shown in tables."""
+        ...
+
+    def act(self, obs_BVF: np.ndarray) -> np.ndarray:
+        """Return the actions (B,), int64, for raw observations (B, V, F)."""
+        ...
+
+
+class QAgent:
+    """Drives greedily by a Q-network.
+
+    Args:
+        network: the network; it is used as it is, not copied.
+        name: the name shown in tables.
+        metadata: what was saved with the network.
+    """
+
+    def __init__(self, network: QNetwork, name: str = "agent", metadata: dict[str, Any] | None = None) -> None:
+        self.network, self.name, self.metadata = network, name, metadata or {}
+
+    def act(self, obs_BVF: np.ndarray) -> np.ndarray:
+        """Return the greedy actions (B,), int64.
+
+        Raises:
+            RapidError: the observations have the wrong shape or are not finite.
+        """
+        return self.q_values(obs_BVF).argmax(1)
+
+    @torch.inference_mode()
+    def q_values(self, obs_BVF: np.ndarray) -> np.ndarray:
+        """Return the Q-values (B, A), float32.
+
+        Raises:
+            RapidError: the observations have the wrong shape or are not finite.
+        """
+        return self.network(self._tensor(obs_BVF)).cpu().numpy()
+
+    def explain(self, obs_BVF: np.ndarray) -> Explanation:
+        """Return the Q-values and the routing weights, gate and attention they rest on.
+
+        Raises:
+            RapidError: the observations have the wrong shape or are not finite.
+        """
+        return self.network.explain(self._tensor(obs_BVF))
+
+    def _tensor(self, obs_BVF: np.ndarray) -> Tensor:
+        return torch.from_numpy(check_observations(obs_BVF, self.name)).to(self.network.scale_F.device)
+
+
+def check_observations(obs_BVF: np.ndarray, name: str) -> np.ndarray:
+    """Return the observations as contiguous float32 (B, V, F).
+
+    Raises:
+        RapidError: they have the wrong shape or are not finite.
+    """
+    obs_BVF = np.ascontiguousarray(obs_BVF, np.float32)
+    if obs_BVF.ndim != 3 or obs_BVF.shape[1:] != (NUM_VEHICLES, NUM_FEATURES):
+        raise RapidError(
+            f"Agent '{name}' was given observations of shape {obs_BVF.shape}, but reads (batch, {NUM_VEHICLES}, "
+            f"{NUM_FEATURES}): {NUM_VEHICLES} vehicles with {', '.join(FEATURES)}. Use a scenario of rapid.scenarios."
+        )
+    if not np.isfinite(obs_BVF).all():
+        world, vehicle, feature = (int(index) for index in np.argwhere(~np.isfinite(obs_BVF))[0])
+        raise RapidError(
+            f"Agent '{name}' was given an observation that is not finite: world {world}, vehicle {vehicle}, "
+            f"{FEATURES[feature]} = {obs_BVF[world, vehicle, feature]}. Check what feeds the agent."
+        )
+    return obs_BVF
+
+
+def save_agent(directory: str | os.PathLike[str], network: QNetwork, metadata: dict[str, Any]) -> None:
+    """Write a network to `directory`, as ``config.json`` and ``weights.safetensors``.
+
+    Args:
+        directory: made if needed; an agent already there is replaced.
+        network: the network.
+        metadata: plain JSON values: how it was made.
+
+    Raises:
+        RapidError: the directory cannot be written.
+    """
+    folder = Path(directory)
+    # A clone each, since safetensors refuses tensors that share memory.
+    weights = {key: value.detach().cpu().contiguous().clone() for key, value in network.state_dict().items()}
+    files.write_bytes(folder / WEIGHTS_FILE, save(weights))
+    files.write_json(
+        folder / CONFIG_FILE,
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "network": dataclasses.asdict(network.config),
+            "lanes": network.lanes,
+            "features": list(FEATURES),
+            "ranges": [float(value) for value in network.scale_F],
+            "vehicles": NUM_VEHICLES,
+            "actions": list(ACTIONS),
+            "weights_sha256": files.sha256(folder / WEIGHTS_FILE),
+            "metadata": metadata,
+        },
+    )
+
+
+def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent:
+    """Read an agent that :func:`save_agent` wrote; it is called after its directory unless its metadata has a `name`.
+
+    Raises:
+        RapidError: there is no agent, or it is damaged, of another version, or does not fit this program.
+    """
+    folder = Path(directory)
+    config = files.read_json(folder / CONFIG_FILE, "agent")
+    if not isinstance(config, dict) or config.get("format") != FORMAT:
+        raise RapidError(f"'{folder / CONFIG_FILE}' does not describe an agent. Give the directory of a saved agent.")
+    if config.get("version") != VERSION:
+        raise RapidError(
+            f"The agent '{folder}' has format version {config.get('version')}, but this program reads version "
+            f"{VERSION}. Use the program's version that wrote it, or train it again."
+        )
+    spaces = {"features": list(FEATURES), "vehicles": NUM_VEHICLES, "actions": list(ACTIONS)}
+    for key, expected in spaces.items():
+        if config.get(key) != expected:
+            raise RapidError(
+                f"The agent '{folder}' was made for {key} {config.get(key)}, but this program has {expected}. "
+                "It cannot drive here."
+            )
+    lanes, metadata = config.get("lanes"), config.get("metadata")
+    if not isinstance(lanes, int) or not isinstance(config.get("network"), dict) or not isinstance(metadata, dict):
+        raise RapidError(
+            f"The agent '{folder}' is damaged: {CONFIG_FILE} lacks network, lanes or metadata. Save it again."
+        )
+    settings = apply_overrides(NetworkConfig(), config["network"], "network", f"'{folder / CONFIG_FILE}'")
+    network = build_network(settings, lanes, seed=0)
+    _load_weights(network, folder, config.get("weights_sha256"))
+    return QAgent(network.to(device).eval(), str(metadata.get("name") or folder.resolve().name), metadata)
+
+
+def _load_weights(network: QNetwork, folder: Path, sha256: Any) -> None:
+    path = folder / WEIGHTS_FILE
+    if not path.is_file():
+        raise RapidError(f"The agent '{folder}' has no {WEIGHTS_FILE}. Copy the whole directory of the agent.")
+    try:
+        weights = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise RapidError(f"The weights '{path}' cannot be read: {error}. Copy or train the agent again.") from error
+    if files.sha256(path) != sha256:
+        raise RapidError(f"The weights '{path}' are not those that {CONFIG_FILE} names. Copy or train the agent again.")
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise RapidError(
+            f"The weights '{path}' do not fit the network in {CONFIG_FILE}: {str(error).splitlines()[-1].strip()} "
+            "Copy or train the agent again."
+        ) from error

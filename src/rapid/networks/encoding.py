@@ -1,0 +1,76 @@
+"""What a network reads: the raw observation, turned into features inside the network.
+
+Observations arrive as the environment gives them: (B, V, F), float32, metres and m/s, absolute, the ego in row 0.
+"""
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from rapid.scenarios import NUM_VEHICLES
+
+LANE_WIDTH = 4.0
+"""Metres."""
+EGO_UNITS = (1.0, 50.0, LANE_WIDTH, 10.0, 5.0)
+"""The units of ego-relative features: 50 m along the road, one lane, 10 m/s along, 5 m/s across."""
+
+
+def feature_scale(lanes: int) -> Tensor:
+    """Return what 1 means in each normalised feature (F,): 1, 200 m, 4*lanes m, 80 m/s, 80 m/s.
+
+    These are the ranges by which highway-env itself normalises observations of a road with `lanes` lanes.
+    """
+    return torch.tensor([1.0, 200.0, LANE_WIDTH * lanes, 80.0, 80.0])
+
+
+def normalize(obs_BVF: Tensor, scale_F: Tensor) -> Tensor:
+    """Map the ranges to +-1, without clipping; presence stays as it is."""
+    return obs_BVF / scale_F
+
+
+def denormalize(normalized_BVF: Tensor, scale_F: Tensor) -> Tensor:
+    """Undo :func:`normalize`, up to the rounding of float32."""
+    return normalized_BVF * scale_F
+
+
+class Encoding(nn.Module):
+    """Observation to features (B, V, F) and an attention mask.
+
+    Args:
+        kind: `raw` as it is; `normalized` scaled by :func:`feature_scale`; `ego` relative to the ego in
+            :data:`EGO_UNITS`: the ego keeps its lane and speed and loses its x, for the road looks the same everywhere.
+        lanes: lanes of the road, for the ranges.
+        mask_absent: hide rows with presence below one half, apart from the ego's: their features read 0, and
+            attention cannot see them.
+    """
+
+    scale_F: Tensor
+    unit_F: Tensor
+
+    def __init__(self, kind: Literal["raw", "normalized", "ego"], lanes: int, mask_absent: bool) -> None:
+        super().__init__()
+        self.kind, self.mask_absent = kind, mask_absent
+        self.register_buffer("scale_F", feature_scale(lanes))
+        self.register_buffer("unit_F", torch.tensor(EGO_UNITS))
+        # Row 0 is always the ego, and there must be something to attend to.
+        self.register_buffer("_is_ego_V1", (torch.arange(NUM_VEHICLES) == 0)[:, None], persistent=False)
+
+    def forward(self, obs_BVF: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the features (B, V, F) and the mask to add to attention scores (B, 1, 1, V), or None."""
+        features_BVF = self._features(obs_BVF)
+        if not self.mask_absent:
+            return features_BVF, None
+        present_BV1 = (obs_BVF[..., :1] > 0.5) | self.get_buffer("_is_ego_V1")
+        mask_BV = torch.where(present_BV1, 0.0, -torch.inf).squeeze(-1)
+        return torch.where(present_BV1, features_BVF, 0.0), mask_BV[:, None, None, :]
+
+    def _features(self, obs_BVF: Tensor) -> Tensor:
+        if self.kind == "raw":
+            return obs_BVF
+        if self.kind == "normalized":
+            return normalize(obs_BVF, self.scale_F)
+        ego_B1F = obs_BVF[:, :1]
+        others_BVF = torch.cat([obs_BVF[:, 1:, :1], obs_BVF[:, 1:, 1:] - ego_B1F[..., 1:]], -1)
+        own_B1F = torch.cat([ego_B1F[..., :1], torch.zeros_like(ego_B1F[..., :1]), ego_B1F[..., 2:]], -1)
+        return torch.cat([own_B1F, others_BVF], 1) / self.unit_F

@@ -1,0 +1,218 @@
+"""Q-networks: RAPID's mixture of policies, its single policy, and two kinds of MLP, all with one interface.
+
+Shapes: B batch, V vehicles, F features, D width, N policies, A actions, L layers, H heads.
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rapid.config import NetworkConfig
+from rapid.errors import RapidError
+from rapid.networks.blocks import Transformer
+from rapid.networks.encoding import Encoding
+from rapid.networks.mixture import MixtureOfPolicies
+from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
+from rapid.seeding import torch_stream
+
+Phase = Literal["distill", "adapt", "all"]
+
+
+class Explanation(NamedTuple):
+    """Why a network prefers an action; tensors without gradient, None where the network has no such part."""
+
+    q_BA: Tensor
+    """The Q-values."""
+    q_without_BVA: Tensor
+    """The Q-values when one vehicle is hidden: entry v without vehicle v; the ego's entry is `q_BA` itself."""
+    weights_BVN: Tensor | None
+    """The signed weight of each policy for each vehicle, after the zero gate."""
+    router_BVN: Tensor | None
+    """The router's weights before the gate; each vehicle's sum to 1."""
+    gate_NV: Tensor | None
+    """The zero gate of the adapters, (N-1, V)."""
+    attention_BLHV: Tensor | None
+    """How much the token from which Q is read attends to each vehicle, in every layer and head of the decoder. Where an
+    action token is prepended, the share missing to 1 is its attention to itself."""
+
+
+class ActionDecoder(nn.Module):
+    """Vehicle tokens to Q-values: a transformer whose first token is read (paper: appendix, "Action Decoder")."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        prepend = config.action_token == "prepend"
+        self.action_token = nn.Parameter(torch.empty(1, 1, config.width)) if prepend else None
+        self.transformer = Transformer(config.layers, config.width, config.heads, config.feedforward)
+        self.head = nn.Linear(config.width, NUM_ACTIONS)
+
+    def forward(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> Tensor:
+        """Return the Q-values (B, A)."""
+        tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V)
+        return self.head(self.transformer(tokens_BTD, mask_B11T, first_only=True)[:, 0])
+
+    def attention(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> Tensor:
+        """Return the attention of the token that is read to the vehicles (B, L, H, V)."""
+        tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V)
+        return self.transformer.attention(tokens_BTD, mask_B11T)[:, :, :, 0, -NUM_VEHICLES:]
+
+    def _with_action_token(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        if self.action_token is None:
+            return tokens_BVD, mask_B11V
+        tokens_BTD = torch.cat([self.action_token.expand(tokens_BVD.shape[0], -1, -1), tokens_BVD], 1)
+        # Padding with 0 lets every token see the action token.
+        return tokens_BTD, None if mask_B11V is None else nn.functional.pad(mask_B11V, (1, 0))
+
+
+class TokenHead(nn.Module):
+    """The mixture of policies and the action decoder: kinds `rapid` and, with one policy, `attentive`."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.mixture = MixtureOfPolicies(config, config.num_policies if config.kind == "rapid" else 1)
+        self.decoder = ActionDecoder(config)
+
+    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
+        """Return the Q-values (B, A)."""
+        return self.decoder(self.mixture(features_BVF, mask_B11V), mask_B11V)
+
+
+class MlpHead(nn.Module):
+    """Weighted sum of the Q-values of N multilayer perceptrons over the flattened observation.
+
+    With N = 1 this is the baselines' network (paper: hyperparameter table); with more it is the mixture of *actions*
+    that the remark in section 3.3 compares against: weights learned, but the same for every vehicle and state. They
+    start at (1, 0, ..., 0), so that the two training phases mean the same as for the mixture of policies.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        count = config.num_policies if config.kind == "mlp-mixture" else 1
+        self.mlps = nn.ModuleList(self._mlp(config.hidden) for _ in range(count))
+        self.weights_N = nn.Parameter(torch.zeros(count)) if count > 1 else None
+
+    @staticmethod
+    def _mlp(hidden: tuple[int, ...]) -> nn.Sequential:
+        sizes = (NUM_VEHICLES * NUM_FEATURES, *hidden)
+        layers: list[nn.Module] = [nn.Flatten()]
+        for inputs, outputs in zip(sizes, hidden, strict=False):
+            layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+        return nn.Sequential(*layers, nn.Linear(sizes[-1], NUM_ACTIONS))
+
+    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
+        """Return the Q-values (B, A); the features of absent rows are zero already, so the mask has no use here."""
+        if self.weights_N is None:
+            return self.mlps[0](features_BVF)
+        return torch.stack([mlp(features_BVF) for mlp in self.mlps], -1) @ self.weights_N
+
+
+class QNetwork(nn.Module):
+    """Raw observations (B, V, F) in, Q-values (B, A) out; the policy is their argmax."""
+
+    def __init__(self, config: NetworkConfig, lanes: int) -> None:
+        super().__init__()
+        self.config, self.lanes = config, lanes
+        self.encoding = Encoding(config.input, lanes, config.mask_absent)
+        self.head = TokenHead(config) if config.kind in ("rapid", "attentive") else MlpHead(config)
+
+    @property
+    def scale_F(self) -> Tensor:
+        """What 1 means in each normalised feature (F,): metres and m/s."""
+        return self.encoding.scale_F
+
+    def forward(self, obs_BVF: Tensor) -> Tensor:
+        """Return the Q-values (B, A)."""
+        return self.head(*self.encoding(obs_BVF))
+
+    @torch.no_grad()
+    def explain(self, obs_BVF: Tensor) -> Explanation:
+        """Return the Q-values and what they rest on, for each vehicle."""
+        q_BA = self(obs_BVF)
+        batch = obs_BVF.shape[0]
+        hidden_BVVF = obs_BVF[:, None] * (1 - torch.eye(NUM_VEHICLES, device=obs_BVF.device))[:, :, None]
+        q_without_BVA = self(hidden_BVVF.flatten(0, 1)).view(batch, NUM_VEHICLES, -1)
+        q_without_BVA[:, 0] = q_BA
+        if not isinstance(self.head, TokenHead):
+            return Explanation(q_BA, q_without_BVA, None, None, None, None)
+        features_BVF, mask_B11V = self.encoding(obs_BVF)
+        mixture = self.head.mixture
+        router_BVN, weights_BVN = mixture.weights(features_BVF)
+        attention_BLHV = self.head.decoder.attention(mixture(features_BVF, mask_B11V), mask_B11V)
+        gate_NV = mixture.gate_NV.detach().clone()
+        return Explanation(q_BA, q_without_BVA, weights_BVN, router_BVN, gate_NV, attention_BLHV)
+
+
+def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
+    """Return a new network whose weights depend on `config` and `seed` alone, with every parameter trainable.
+
+    Raises:
+        RapidError: N < 1, K outside 1..N, or a width that the heads do not divide.
+    """
+    if config.num_policies < 1 or not 1 <= config.top_k <= config.num_policies:
+        raise RapidError(
+            f"A network with num_policies N = {config.num_policies} and top_k K = {config.top_k} cannot be built: "
+            "N must be at least 1 and K between 1 and N."
+        )
+    if config.heads < 1 or config.width % config.heads or config.layers < 1:
+        raise RapidError(
+            f"A network of width {config.width} with {config.heads} heads and {config.layers} layers cannot be built: "
+            "the width must be a multiple of the heads, with at least one head and one layer."
+        )
+    # The constructors draw from the global stream; every such value is overwritten below, so its state is kept.
+    with torch.random.fork_rng(devices=[]):
+        network = QNetwork(config, lanes)
+    _initialize(network, torch_stream(seed, "network"))
+    return network
+
+
+@torch.no_grad()
+def _initialize(network: QNetwork, generator: torch.Generator) -> None:
+    """Draw the weights: linear layers uniform within 1/sqrt(inputs), embeddings normal with deviation 0.02, g zero."""
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            bound = module.in_features**-0.5
+            for parameter in (module.weight, module.bias):
+                parameter.uniform_(-bound, bound, generator=generator)
+    for name, parameter in network.named_parameters():
+        if name.endswith(("position", "action_token")):
+            parameter.normal_(0, 0.02, generator=generator)
+        elif name.endswith("weights_N"):
+            parameter[0] = 1
+
+
+def set_phase(network: QNetwork, phase: Phase, freeze_decoder: bool = False) -> None:
+    """Choose what is trained by setting ``requires_grad`` (paper: figure 3 and section 3.3).
+
+    `distill` (phase 2) trains policy 1, the router and the decoder. `adapt` (phase 3) freezes policy 1 and trains the
+    adapters, the zero gate, the router and, unless `freeze_decoder`, the decoder. `all` trains every weight. In a
+    mixture of actions the MLPs stand for the policies and their weights for the gate. A network without adapters has
+    no phase 3.
+
+    Raises:
+        RapidError: `adapt` on a network without adapters, or `freeze_decoder` on one without a decoder.
+    """
+    head = network.head
+    if isinstance(head, TokenHead):
+        first, *adapters = head.mixture.policies
+        gate: nn.Parameter | None = head.mixture.gate_NV
+    else:
+        first, *adapters = head.mlps
+        gate = head.weights_N
+    if phase == "adapt" and not adapters:
+        raise RapidError(
+            f"A '{network.config.kind}' network with one policy has no adapter to train. "
+            "Set adapt.train to 'all' or 'scratch', or distil a network of kind 'rapid' with num_policies >= 2."
+        )
+    network.requires_grad_(True)
+    if phase == "distill":
+        for adapter in adapters:
+            adapter.requires_grad_(False)
+        if gate is not None:
+            gate.requires_grad_(False)
+    elif phase == "adapt":
+        first.requires_grad_(False)
+    if freeze_decoder:
+        if not isinstance(head, TokenHead):
+            raise RapidError(f"A '{network.config.kind}' network has no decoder to freeze. Unset freeze_decoder.")
+        head.decoder.requires_grad_(False)
