@@ -18,21 +18,21 @@ def card(dataset: Dataset) -> str:
         f"Highway driving, {scenario.lanes} lanes, density {scenario.density:g}, dynamics of `{scenario.env_id}`, "
         f"reward `{scenario.reward}`. One decision a second, at most 30 an episode. Licence: {LICENCE}.",
         "",
-        "| source | driver | transitions | whole episodes | return (mean ± std over episodes) | return quartiles "
+        "| source | driver | transitions | whole episodes collected | return (mean ± std over episodes) | return quartiles "
         "| crashed | speed, m/s |",
         "|---|---|---|---|---|---|---|---|",
     ]
     present = [name for name in SOURCES if name in facts]
     for name in present:
-        row = facts[name]
+        row = facts[name] if dataset.mixture is None else dataset.mixture["sources"][name]
         score, quartiles, crashed = "–", "–", "–"
-        if row["whole_episodes"]:
+        if "episodes" in row:
             score = f"{row['return_mean']:.2f} ± {row['return_std']:.2f}"
             quartiles = " / ".join(f"{value:.1f}" for value in row["return_quantiles"])
             crashed = f"{row['crash_share']:.1%}"
         driver = dataset.drivers.get(name, {}).get("name", "unknown")
         lines.append(
-            f"| {name} | {driver} | {row['transitions']} | {row['whole_episodes']} | {score} | {quartiles} | {crashed} "
+            f"| {name} | {driver} | {facts[name]['transitions']} | {row.get('episodes', '–')} | {score} | {quartiles} | {crashed} "
             f"| {row['mean_speed']:.1f} |"
         )
     lines += ["", "| share of actions | " + " | ".join(facts[present[0]]["actions"] if present else ()) + " |"]

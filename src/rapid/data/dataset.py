@@ -37,7 +37,7 @@ class Dataset:
     log: pa.Table | None = None
     """One row a decision (`tables.LOG_SCHEMA`), in the order of the transitions; None in a mixture."""
     mixture: dict[str, Any] | None = None
-    """How it was mixed: p, size, level, seed; None if it was collected."""
+    """How it was mixed: p, size, level, seed, and the summary of each source; None if it was collected."""
     collection: dict[str, Any] | None = None
     """How it was collected: seeds, shard, whether it is complete."""
 
@@ -149,17 +149,18 @@ def summary(dataset: Dataset) -> dict[str, Any]:
         rows = dataset.transitions.select(dataset.transitions.source_N == source)
         if not len(rows):
             continue
-        returns, crashed = episode_returns(rows)
         share = np.bincount(rows.action_N, minlength=len(ACTIONS)) / len(rows)
         speed = np.hypot(rows.obs_NVF[:, 0, 3], rows.obs_NVF[:, 0, 4])
         facts: dict[str, Any] = {
             "transitions": len(rows),
-            "whole_episodes": len(returns),
             "mean_reward": _round(rows.reward_N.mean(dtype=np.float64)),
             "mean_speed": _round(speed.mean(dtype=np.float64)),
             "actions": dict(zip(ACTIONS, map(_round, share), strict=True)),
         }
+        # Of a mixture, mostly the short episodes are whole: their returns would mislead.
+        returns, crashed = episode_returns(rows) if dataset.mixture is None else (np.zeros(0), np.zeros(0))
         if len(returns):
+            facts["episodes"] = len(returns)
             quantiles = np.quantile(returns, (0, 0.25, 0.5, 0.75, 1))
             facts["return_mean"], facts["return_std"] = _round(returns.mean()), _round(returns.std())
             facts["return_quantiles"] = [_round(value) for value in quantiles]
@@ -212,6 +213,7 @@ def mix(
     rng = numpy_stream(seed, "mix")
     parts: list[Transitions] = []
     drivers: dict[str, dict[str, Any]] = {}
+    sources: dict[str, Any] = {}
     for source, count in wanted.items():
         if not count and not (level == "batch" and (p if source == TEACHER else 1 - p) > 0):
             continue
@@ -229,8 +231,9 @@ def mix(
             )
         # Sorted, so that neighbours that both were drawn stay neighbours: n-step returns can use them.
         parts.append(rows.select(np.sort(rng.choice(have, count, replace=False))))
+        sources[SOURCES[source]] = summary(given[source])[SOURCES[source]]
         drivers |= {name: facts for name, facts in given[source].drivers.items() if name == SOURCES[source]}
-    mixture = {"p": p, "size": size, "level": level, "seed": seed}
+    mixture = {"p": p, "size": size, "level": level, "seed": seed, "sources": sources}
     return Dataset(names[0], concatenate(parts), drivers, mixture=mixture)
 
 

@@ -1,0 +1,158 @@
+"""Phase 1, collecting: a driver in many episodes side by side, every decision safe on disk (paper: sections 3.1, 4.2).
+
+A directory in progress holds ``collecting/``: the settings, a Parquet part for each finished group of episodes and the
+journal of the group in progress. A complete one holds the dataset alone. The same command goes on wherever a process
+was ended, by any signal, and ends with the same bytes as if it had never been.
+"""
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rapid.data.dataset import DATASET_FILE, Dataset, load_dataset, save_dataset
+from rapid.data.driving import Budget, Collecting, MakeWorlds
+from rapid.data.journal import exclusive
+from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
+from rapid.errors import RapidError
+from rapid.files import read_json, write_json
+from rapid.progress import Task
+from rapid.scenarios import get_scenario
+from rapid.spawns import TrainPart, train_part
+from rapid.teacher.decision import Teacher
+
+
+def parse_shard(shard: str) -> tuple[int, int]:
+    """Return (i, n) of ``"i/n"``, 1 <= i <= n.
+
+    Raises:
+        RapidError: it is not written so.
+    """
+    left, _, right = shard.partition("/")
+    if left.isdecimal() and right.isdecimal() and 1 <= int(left) <= int(right):
+        return int(left), int(right)
+    raise RapidError(f"Shard '{shard}' is not of the form i/n with 1 <= i <= n. For the second of four, write 2/4.")
+
+
+def collect(
+    teacher: Teacher,
+    scenario: str,
+    directory: str | os.PathLike[str],
+    transitions: int,
+    lockstep: int = 16,
+    *,
+    source: TrainPart = "teacher",
+    seeds: Sequence[int] | None = None,
+    shard: str = "1/1",
+    budget: Budget | None = None,
+    make_worlds: MakeWorlds | None = None,
+    progress: Task | None = None,
+) -> Dataset:
+    """Collect whole episodes until there are at least `transitions`, or go on with what the directory holds.
+
+    Args:
+        teacher: who drives.
+        scenario: name of the scenario.
+        directory: the dataset's place.
+        transitions: how many; of all shards together. At most 29 more are collected, to end with a whole episode.
+        lockstep: episodes driven side by side.
+        source: `teacher` or `random`: the provenance of every transition.
+        seeds: spawn seeds, used in order; None is the part of the set `train` that belongs to the source.
+        shard: `i/n` collects every n-th seed from the i-th on, and 1/n of the transitions.
+        budget: when to stop early; the dataset then has the finished groups and a later call goes on.
+        make_worlds: gives a vector environment of so many worlds in which a finished world waits; None is
+            `rapid.make_vec(scenario, n, autoreset=False)`.
+        progress: counts transitions; its note shows decisions/s, cost and the share of fallbacks.
+
+    Raises:
+        RapidError: the directory holds something else, is in use or damaged, the seeds or the budget do not suffice.
+    """
+    root = Path(directory)
+    part, parts = parse_shard(shard)
+    seeds = (train_part(source) if seeds is None else seeds)[part - 1 :: parts]
+    settings = {
+        "scenario": get_scenario(scenario).name,
+        "source": source,
+        # As it will be read back, so that the comparison sees no tuples.
+        "driver": json.loads(json.dumps({"name": teacher.name, **teacher.describe()})),
+        "seeds": {"first": seeds[0] if len(seeds) else None, "count": len(seeds)},
+        "shard": shard,
+    }
+    work = root / "collecting"
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RapidError(f"Cannot collect in '{root}': {error}. Choose a directory that you can write to.") from error
+    with exclusive(work / "lock"):
+        dataset = _resume(root, work, settings)
+        target = math.ceil(transitions / parts)
+        if dataset is not None:
+            if len(dataset) >= target:
+                shutil.rmtree(work)
+                if progress:
+                    progress.skip(len(dataset))
+                return dataset
+            _reopen(dataset, work)
+            write_json(work / "settings.json", settings)
+            (root / DATASET_FILE).unlink()
+        run = Collecting(teacher, settings, work, budget or Budget(), progress)
+        spent = run.collect_until(target, lockstep, seeds, make_worlds or _default_worlds(scenario))
+        dataset = run.dataset(complete=not spent)
+        if not len(dataset):
+            raise RapidError(
+                f"{spent} before the first group of episodes was finished. Every decision is kept: raise the budget "
+                "and run the same command again, or collect fewer episodes side by side."
+            )
+        save_dataset(dataset, root)
+        if not spent:
+            shutil.rmtree(work)
+        return dataset
+
+
+def _default_worlds(scenario: str) -> MakeWorlds:
+    from rapid.simulator import make_vec
+
+    return lambda count: make_vec(scenario, count, autoreset=False)
+
+
+def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
+    """Check that the directory is of these settings; return its dataset if it is complete."""
+    dataset = load_dataset(root) if (root / DATASET_FILE).exists() else None
+    before: dict[str, Any] | None = None
+    if dataset is not None:
+        before = (dataset.collection or {}).get("settings", {})
+    elif (work / "settings.json").exists():
+        before = read_json(work / "settings.json", "record of the collection")
+    elif (work / "journal.jsonl").exists() or any(work.glob("part-*")):
+        raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
+    if before is not None and before != settings:
+        wrong = [name for name in settings if before.get(name) != settings[name]]
+        raise RapidError(
+            f"'{root}' was collected with other settings: {', '.join(wrong)} differ. Choose another directory, or use "
+            "the same settings to go on."
+        )
+    if dataset is None or not dataset.collection or not dataset.collection["complete"]:
+        if dataset is not None and not (work / "settings.json").exists():
+            _reopen(dataset, work)
+        write_json(work / "settings.json", settings)
+        return None
+    # A complete dataset is the truth; what lies beside it was left by a process that ended while cleaning up.
+    for path in work.glob("part-*"):
+        path.unlink()
+    (work / "journal.jsonl").unlink(missing_ok=True)
+    (work / "settings.json").unlink(missing_ok=True)
+    return dataset
+
+
+def _reopen(dataset: Dataset, work: Path) -> None:
+    """Make a part of a dataset, so that a collection can go on from it."""
+    table = to_table(dataset.transitions)
+    if dataset.log is None:
+        raise RapidError(f"The dataset beside '{work}' has no teacher log to go on from. Choose another directory.")
+    for field in PART_SCHEMA:
+        if field.name not in table.column_names:
+            table = table.append_column(field, dataset.log.column(field.name))
+    write_parquet(table.cast(PART_SCHEMA), work / "part-00000.parquet")

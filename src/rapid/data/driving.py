@@ -1,0 +1,211 @@
+"""Driving groups of episodes side by side: every decision goes to the journal before it acts."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from rapid.data.dataset import Dataset
+from rapid.data.journal import Journal
+from rapid.data.tables import (
+    LOG_SCHEMA,
+    PART_SCHEMA,
+    TRANSITION_SCHEMA,
+    from_table,
+    read_parquet,
+    to_table,
+    write_parquet,
+)
+from rapid.data.transitions import SOURCES, TEACHER, Transitions
+from rapid.errors import RapidError
+from rapid.progress import Task
+from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
+from rapid.seeding import stream_seed
+from rapid.teacher.decision import Decision, Teacher
+
+MakeWorlds = Callable[[int], Any]
+"""Gives a vector environment of so many worlds, in which a finished world waits for the others."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When to stop early; 0 is no limit. Tokens and cost count over all runs of a collection, seconds over this one."""
+
+    tokens: int = 0
+    """Tokens read and written."""
+    cost: float = 0.0
+    """Price, in the currency of the settings."""
+    seconds: float = 0.0
+    """Wall-clock seconds of this process."""
+
+
+class SpentError(Exception):
+    """The budget is spent; the message says which."""
+
+
+class Collecting:
+    """One process's share of a collection: the finished parts and what they add up to."""
+
+    def __init__(
+        self, teacher: Teacher, settings: dict[str, Any], work: Path, budget: Budget, progress: Task | None
+    ) -> None:
+        self.teacher, self.settings, self.work, self.budget, self.progress = teacher, settings, work, budget, progress
+        self.source = SOURCES.index(settings["source"])
+        self.parts = [read_parquet(path, "part of a collection") for path in sorted(work.glob("part-*.parquet"))]
+        self.count = sum(part.num_rows for part in self.parts)
+        self.episodes = sum(len(part.column("episode").unique()) for part in self.parts)
+        self.fresh, self.decisions = 0, self.count
+        self.tokens = int(sum(self._sum(name) for name in ("tokens_in", "tokens_out")))
+        self.cost = self._sum("cost")
+        self.fallbacks = sum(part.column("status").to_pylist().count("fallback") for part in self.parts)
+        self.start = time.monotonic()
+        if progress:
+            progress.skip(self.count)
+
+    def collect_until(self, target: int, lockstep: int, seeds: Sequence[int], make_worlds: MakeWorlds) -> str:
+        """Drive groups until there are `target` transitions; return which budget was spent, or nothing."""
+        duration = int(get_scenario(self.settings["scenario"]).config()["duration"])
+        worlds: Any = None
+        try:
+            while self.count < target:
+                journal = Journal(self.work / "journal.jsonl", len(self.parts))
+                try:
+                    # The last groups are smaller, so that little more than the target is collected.
+                    wanted = min(lockstep, math.ceil((target - self.count) / duration))
+                    group = journal.seeds or list(seeds[self.episodes : self.episodes + wanted])
+                    if not group:
+                        raise RapidError(
+                            f"All {len(seeds)} spawn seeds are used, and {self.count} of {target} transitions are "
+                            "collected. Ask for fewer transitions, or give more seeds."
+                        )
+                    if journal.seeds is None:
+                        journal.begin(len(self.parts), group)
+                    if worlds is None or worlds.num_envs != len(group):
+                        if worlds is not None:
+                            worlds.close()
+                        worlds = make_worlds(len(group))
+                    part = self._drive(worlds, group, journal)
+                    write_parquet(part, self.work / f"part-{len(self.parts):05d}.parquet")
+                    journal.finish()
+                finally:
+                    journal.close()
+                self.parts.append(part)
+                self.count += part.num_rows
+                self.episodes += len(group)
+        except SpentError as spent:
+            return str(spent)
+        finally:
+            if worlds is not None:
+                worlds.close()
+        return ""
+
+    def _drive(self, worlds: Any, seeds: list[int], journal: Journal) -> pa.Table:
+        """Drive one group of episodes to their ends, from the journal as far as it goes."""
+        obs_BVF, _ = worlds.reset(seed=seeds)
+        active = np.arange(len(seeds))
+        previous: list[Decision | None] = [None] * len(seeds)
+        steps: list[dict[str, Any]] = []
+        step = 0
+        while len(active):
+            # A vector environment may hand out the same array at every step.
+            seen = np.array(obs_BVF[active], np.float32)
+            decisions = journal.recall(seen)
+            if decisions is None:
+                self._check_budget()
+                keys = np.array([stream_seed(seeds[world], f"step/{step}") for world in active], np.int64)
+                decisions = self.teacher.decide(seen, [previous[world] for world in active], keys)
+                journal.append(seen, decisions)
+                self.fresh += len(decisions)
+            self._count(decisions)
+            # The actions of finished worlds are ignored.
+            actions = np.full(len(seeds), IDLE, np.int64)
+            actions[active] = [decision.action for decision in decisions]
+            obs_BVF, reward_B, terminated_B, truncated_B, _ = worlds.step(actions)
+            for place, world in enumerate(active):
+                previous[world] = decisions[place]
+                steps.append(
+                    {
+                        "world": int(world),
+                        "step": step,
+                        "obs": seen[place],
+                        "next_obs": np.array(obs_BVF[world], np.float32),
+                        "reward": reward_B[world],
+                        "terminated": terminated_B[world],
+                        # A crash at the last second is a crash.
+                        "truncated": truncated_B[world] and not terminated_B[world],
+                        "decision": decisions[place],
+                    }
+                )
+            active = active[~(terminated_B | truncated_B)[active]]
+            step += 1
+            self._show(len(decisions))
+        return self._table(sorted(steps, key=lambda row: row["world"]), seeds)
+
+    def _table(self, steps: list[dict[str, Any]], seeds: list[int]) -> pa.Table:
+        """Return the steps of a group as a table of `PART_SCHEMA`."""
+        said: list[Decision] = [row["decision"] for row in steps]
+        world_N = np.array([row["world"] for row in steps])
+        unknown = (math.nan,) * NUM_ACTIONS
+        transitions = Transitions(
+            obs_NVF=np.stack([row["obs"] for row in steps]),
+            action_N=np.array([decision.action for decision in said], np.int64),
+            reward_N=np.array([row["reward"] for row in steps], np.float32),
+            next_obs_NVF=np.stack([row["next_obs"] for row in steps]),
+            terminated_N=np.array([row["terminated"] for row in steps], np.bool_),
+            truncated_N=np.array([row["truncated"] for row in steps], np.bool_),
+            source_N=np.full(len(steps), self.source, np.int8),
+            episode_N=self.episodes + world_N,
+            step_N=np.array([row["step"] for row in steps], np.int64),
+            spawn_seed_N=np.array(seeds, np.int64)[world_N],
+            probabilities_NA=np.array([decision.probabilities or unknown for decision in said], np.float32),
+        ).validate("the steps just collected")
+        table = to_table(transitions)
+        for field in PART_SCHEMA:
+            if field.name not in TRANSITION_SCHEMA.names:
+                table = table.append_column(field, pa.array([getattr(row, field.name) for row in said], field.type))
+        return table
+
+    def dataset(self, complete: bool) -> Dataset:
+        """Return everything collected so far as a dataset."""
+        table = pa.concat_tables([PART_SCHEMA.empty_table(), *self.parts])
+        return Dataset(
+            scenario=self.settings["scenario"],
+            transitions=from_table(table),
+            drivers={self.settings["source"]: self.settings["driver"]},
+            log=table.select(LOG_SCHEMA.names).combine_chunks(),
+            collection={"complete": complete, "settings": self.settings},
+        )
+
+    def _sum(self, name: str) -> float:
+        return float(sum(part.column(name).to_numpy().sum() for part in self.parts))
+
+    def _count(self, decisions: Sequence[Decision]) -> None:
+        """Add to the totals."""
+        self.decisions += len(decisions)
+        self.tokens += sum(decision.tokens_in + decision.tokens_out for decision in decisions)
+        self.cost += sum(decision.cost for decision in decisions)
+        self.fallbacks += sum(decision.status == "fallback" for decision in decisions)
+
+    def _check_budget(self) -> None:
+        budget, seconds = self.budget, time.monotonic() - self.start
+        for name, used, limit in (
+            ("tokens", self.tokens, budget.tokens),
+            ("cost", self.cost, budget.cost),
+            ("seconds", seconds, budget.seconds),
+        ):
+            if limit and used >= limit:
+                raise SpentError(f"The budget of {limit:g} {name} was spent")
+
+    def _show(self, count: int) -> None:
+        if self.progress is None:
+            return
+        rate = self.fresh / max(time.monotonic() - self.start, 1e-9)
+        cost = f", cost {self.cost:.4g}" if self.cost else ""
+        invalid = f", {self.fallbacks / self.decisions:.1%} fallbacks" if self.source == TEACHER else ""
+        self.progress.note(f"{rate:.3g} decisions/s{cost}{invalid}")
+        self.progress.advance(count)

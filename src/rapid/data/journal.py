@@ -1,0 +1,133 @@
+"""The journal of a collection: every decision is on disk before it acts, so that no answer is ever paid for twice."""
+
+import json
+import os
+import zlib
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rapid.errors import RapidError
+from rapid.teacher.decision import Decision, from_record, to_record
+
+_SYNC_AFTER_SECONDS = 0.1
+
+
+class Journal:
+    """The decisions of the group of episodes in progress, one JSON line a lockstep step.
+
+    The simulator is deterministic, so the decisions alone bring the group back to where it was. A last line that was
+    cut off is dropped.
+
+    Raises:
+        RapidError: a line other than the last cannot be read.
+    """
+
+    def __init__(self, path: Path, group: int) -> None:
+        self.path = path
+        self._lines: list[dict[str, Any]] = []
+        content = path.read_bytes() if path.exists() else b""
+        good = 0
+        for number, line in enumerate(content.splitlines(keepends=True), 1):
+            try:
+                if not line.endswith(b"\n"):
+                    break
+                record = json.loads(line)
+            except ValueError as error:
+                if good + len(line) == len(content):
+                    break
+                raise RapidError(
+                    f"Line {number} of '{path}' cannot be read: {error}. The file is damaged; delete it to decide the "
+                    "group of episodes in progress anew."
+                ) from error
+            self._lines.append(record)
+            good += len(line)
+        if self._lines and self._lines[0].get("group") != group:
+            # The group was finished, and the process ended before it could remove its journal.
+            self._lines, good = [], 0
+        if good < len(content):
+            os.truncate(path, good)
+        self._next = 1
+        self._stream = path.open("ab", buffering=0)
+
+    @property
+    def seeds(self) -> list[int] | None:
+        """Spawn seeds of the group in progress; None if the journal is empty."""
+        return self._lines[0]["seeds"] if self._lines else None
+
+    def begin(self, group: int, seeds: Sequence[int]) -> None:
+        """Write the first line."""
+        record = {"group": group, "seeds": list(seeds)}
+        self._lines.append(record)
+        self._write(record)
+
+    def recall(self, obs_BVF: NDArray[np.float32]) -> list[Decision] | None:
+        """Return the recorded decisions for these observations, or None where the record ends.
+
+        Raises:
+            RapidError: the decisions were made for other observations.
+        """
+        if self._next >= len(self._lines):
+            return None
+        record = self._lines[self._next]
+        if record["seen"] != _checksum(obs_BVF):
+            raise RapidError(
+                f"Line {self._next + 1} of '{self.path}' was decided for other observations than the simulator gives "
+                "now: its version or this machine's arithmetic has changed. Delete the file to decide the group anew."
+            )
+        self._next += 1
+        return [from_record(decision) for decision in record["decisions"]]
+
+    def append(self, obs_BVF: NDArray[np.float32], decisions: Sequence[Decision]) -> None:
+        """Write the decisions for these observations, on the disk before it returns."""
+        record = {"seen": _checksum(obs_BVF), "decisions": [to_record(decision) for decision in decisions]}
+        self._lines.append(record)
+        self._next += 1
+        self._write(record)
+        # What the system holds outlives the process; only a power cut could take it. Sync what took long to get.
+        if sum(decision.seconds for decision in decisions) > _SYNC_AFTER_SECONDS:
+            os.fsync(self._stream.fileno())
+
+    def close(self) -> None:
+        """Close the file and keep it."""
+        self._stream.close()
+
+    def finish(self) -> None:
+        """Close and remove the file: the group is safe elsewhere."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+    def _write(self, record: dict[str, Any]) -> None:
+        line = json.dumps(record, ensure_ascii=False, separators=(",", ":")) + "\n"
+        self._stream.write(line.encode())
+
+
+def _checksum(obs_BVF: NDArray[np.float32]) -> int:
+    return zlib.crc32(np.ascontiguousarray(obs_BVF).tobytes())
+
+
+@contextmanager
+def exclusive(path: Path) -> Generator[None, None, None]:
+    """Hold a lock file, which the system releases when the process ends, however it ends.
+
+    Raises:
+        RapidError: another process holds it.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows has no such lock; two processes in one directory are the user's care there.
+        yield
+        return
+    with path.open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RapidError(
+                f"Another process is collecting in '{path.parent}'. Wait for it, or give each its own directory and "
+                "`--shard i/n`."
+            ) from error
+        yield
