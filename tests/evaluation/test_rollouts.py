@@ -172,7 +172,7 @@ def test_tracks_follow_vehicles_through_changes_of_rank() -> None:
 
 def test_rows_of_cells_that_do_not_apply_are_left_out(toy, constant, monkeypatch) -> None:
     monkeypatch.setattr(
-        rollouts, "_resolve", lambda a: (a, None if a == "none" else Noise(needs_gradient=a == "pgd", name=a))
+        rollouts, "_resolve", lambda a, lanes: (a, None if a == "none" else Noise(needs_gradient=a == "pgd", name=a))
     )
     done: list[float] = []
     rows = evaluate_agent(constant(IDLE), SCENARIO, [10, 11], ("none", "uniform", "pgd"), progress=done.append)

@@ -6,7 +6,7 @@ The agent sees what the attack leaves of the observation; everything measured co
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,9 +19,9 @@ from rapid.evaluation.metrics import EpisodeRow, time_to_collision
 from rapid.evaluation.recording import Recording
 from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS, get_scenario
 from rapid.seeding import torch_stream
+from rapid.simulator import Simulator
 
 NO_ATTACK = "none"
-Simulator = Literal["compiled", "highway-env"]
 MAX_WORLDS = 256
 """Worlds that are stepped at once; more seeds are driven in turns."""
 
@@ -96,7 +96,7 @@ class Episodes:
 
 def is_applicable(agent: Any, attack: AttackLike | str | None) -> bool:
     """Whether the attack can be made on the agent: a gradient attack needs the agent's network."""
-    resolved = _resolve(attack)[1]
+    resolved = _resolve(attack, lanes=1)[1]
     return resolved is None or not resolved.needs_gradient or _network(agent) is not None
 
 
@@ -123,7 +123,7 @@ def run_episodes(
     if len(seeds) == 0:
         raise RapidError("There are no spawn seeds to drive. Ask for at least one episode.")
     lanes = get_scenario(scenario).lanes
-    attack_name, resolved = _resolve(attack)
+    attack_name, resolved = _resolve(attack, lanes)
     network = _network(agent)
     if resolved is not None and resolved.needs_gradient and network is None:
         raise RapidError(
@@ -201,15 +201,14 @@ def _network(agent: Any) -> torch.nn.Module | None:
     return network if isinstance(network, torch.nn.Module) else None
 
 
-def _resolve(attack: AttackLike | str | None) -> tuple[str, AttackLike | None]:
-    """Return the attack's name and the attack; None is no attack."""
+def _resolve(attack: AttackLike | str | None, lanes: int) -> tuple[str, AttackLike | None]:
+    """Return the attack's name and the attack on a road with `lanes` lanes; None is no attack."""
     if attack is None or attack == NO_ATTACK:
         return NO_ATTACK, None
     if isinstance(attack, str):
         from rapid.attacks import get_attack
 
-        found = get_attack(attack)
-        return attack, found
+        return attack, get_attack(attack, lanes)
     return str(getattr(attack, "name", type(attack).__name__)), attack
 
 
@@ -227,8 +226,9 @@ class _Perturbation:
         if self.attack is None:
             return obs_BVF
         obs = torch.from_numpy(np.ascontiguousarray(obs_BVF))
-        if self.attack.needs_gradient:
-            seen = self.attack(self.network, obs, self._batch)
+        if self.attack.needs_gradient and self.network is not None:
+            device = next(self.network.parameters()).device
+            seen = self.attack(self.network, obs.to(device), self._batch)
         else:
             each = [self.attack(self.network, obs[i : i + 1], self._streams[world]) for i, world in enumerate(worlds)]
             seen = torch.cat(each)
