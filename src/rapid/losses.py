@@ -12,28 +12,10 @@ from torch.nn import functional
 
 from rapid.attacks.gradient import maximize_loss
 from rapid.config import LossConfig
+from rapid.data.batch import TransitionBatch
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork
 from rapid.scenarios import NUM_ACTIONS
-
-
-class TransitionBatch(NamedTuple):
-    """A batch of transitions, maybe of several steps each."""
-
-    obs_BVF: Tensor
-    """Observations before the action, metres and m/s."""
-    action_B: Tensor
-    """Actions taken, int64."""
-    reward_B: Tensor
-    """Rewards; of several steps, their discounted sum."""
-    next_obs_BVF: Tensor
-    """Observations after the last step, real ones also at the end of an episode."""
-    bootstrap_B: Tensor
-    """Weight of the next state's value: discount to the number of steps, or 0 where the episode terminated."""
-    teacher_B: Tensor
-    """Whether the teacher chose the action, bool."""
-    soft_BA: Tensor | None
-    """The teacher's probabilities of the actions; a row that is not finite was not recorded. None: none was."""
 
 
 class QLoss(NamedTuple):

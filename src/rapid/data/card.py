@@ -18,8 +18,8 @@ def card(dataset: Dataset) -> str:
         f"Highway driving, {scenario.lanes} lanes, density {scenario.density:g}, dynamics of `{scenario.env_id}`, "
         f"reward `{scenario.reward}`. One decision a second, at most 30 an episode. Licence: {LICENCE}.",
         "",
-        "| source | driver | transitions | whole episodes collected | return (mean ± std over episodes) | return quartiles "
-        "| crashed | speed, m/s |",
+        "| source | driver | transitions | whole episodes collected | return (mean ± std over episodes) "
+        "| return quartiles | crashed | speed, m/s |",
         "|---|---|---|---|---|---|---|---|",
     ]
     present = [name for name in SOURCES if name in facts]
@@ -32,8 +32,8 @@ def card(dataset: Dataset) -> str:
             crashed = f"{row['crash_share']:.1%}"
         driver = dataset.drivers.get(name, {}).get("name", "unknown")
         lines.append(
-            f"| {name} | {driver} | {facts[name]['transitions']} | {row.get('episodes', '–')} | {score} | {quartiles} | {crashed} "
-            f"| {row['mean_speed']:.1f} |"
+            f"| {name} | {driver} | {facts[name]['transitions']} | {row.get('episodes', '–')} | {score} "
+            f"| {quartiles} | {crashed} | {row['mean_speed']:.1f} |"
         )
     lines += ["", "| share of actions | " + " | ".join(facts[present[0]]["actions"] if present else ()) + " |"]
     lines.append("|" + "---|" * (1 + len(facts[present[0]]["actions"]) if present else 1))
