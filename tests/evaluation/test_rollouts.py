@@ -11,7 +11,7 @@ import torch
 
 from rapid.errors import RapidError
 from rapid.evaluation import rollouts
-from rapid.evaluation.agents import open_agent
+from rapid.evaluation.agents import kind_of, open_agent
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
 from rapid.evaluation.rollouts import evaluate_agent, is_applicable, run_episodes
 from rapid.scenarios import FASTER, IDLE, LANE_RIGHT
@@ -194,4 +194,11 @@ def test_bad_requests(toy, constant) -> None:
         run_episodes(constant(IDLE), SCENARIO, [])
     with pytest.raises(RapidError, match="did you mean 'slower'"):
         open_agent("slowr", SCENARIO)
-    assert open_agent("slower", SCENARIO).name == "slower"
+
+
+def test_kinds_follow_from_what_an_agent_offers(constant) -> None:
+    assert kind_of(open_agent("slower", SCENARIO)) == "floor"
+    assert kind_of(SimpleNamespace(decide=print, name="smollm2")) == "teacher"
+    assert kind_of(SimpleNamespace(bind=print)) == "planner"
+    assert kind_of(constant(IDLE)) == "learned"
+    assert kind_of(SimpleNamespace(act=print, kind="planner")) == "planner"

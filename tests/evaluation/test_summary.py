@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from test_metrics import ROW
 
-from rapid.evaluation.summary import kind_of, label_of, summarize, summary_text
+from rapid.evaluation.summary import label_of, summarize, summary_text
 
 
 def rows_of(agent: str, attack: str = "none", count: int = 6, **changes):
@@ -18,19 +18,17 @@ def rows_of(agent: str, attack: str = "none", count: int = 6, **changes):
 ROWS = [
     *rows_of("rapid", has_network=True),
     *rows_of("rapid", "pgd", has_network=True, gradient_attack=True, crashed=True),
-    *rows_of("slower"),
-    *rows_of("slower", "uniform"),
-    *rows_of("teacher", count=1),
-    *rows_of("planner"),
+    *rows_of("slower", kind="floor"),
+    *rows_of("slower", "uniform", kind="floor"),
+    *rows_of("smollm2", count=1, kind="teacher"),
+    *rows_of("planner", kind="planner"),
 ]
 
 
 def test_order_kinds_and_labels() -> None:
     table = summarize(ROWS, resamples=100)
-    assert [row.label for row in table] == ["always-slower", "teacher", "planner", "rapid"]
+    assert [row.label for row in table] == ["always-slower", "smollm2", "planner", "rapid"]
     assert [row.is_reference for row in table] == [True, True, True, False]
-    assert kind_of("teacher: smollm2") == "teacher"
-    assert kind_of("teachable") == "learned"
     assert label_of("rapid") == "rapid"
 
 
@@ -42,7 +40,7 @@ def test_cells_say_why_they_are_empty() -> None:
     assert pgd.crashed is not None
     assert pgd.crashed.value == 1
     assert pgd.crashed.low < 0.9
-    assert math.isnan(table["teacher"].metrics["episode_return"].low)
+    assert math.isnan(table["smollm2"].metrics["episode_return"].low)
 
 
 def test_text_is_aligned_and_complete() -> None:

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 import rapid
 from rapid.errors import RapidError, did_you_mean
+from rapid.evaluation.metrics import Kind
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
 
@@ -48,6 +49,17 @@ def open_agent(spec: str, scenario: str, seed: int = 0) -> Any:
         f"There is no agent '{spec}'{did_you_mean(spec, SCRIPTED)} Give the directory of an agent that `rapid distill` "
         f"or `rapid adapt` wrote, or a scripted driver: {', '.join(SCRIPTED)}."
     )
+
+
+def kind_of(agent: Any) -> Kind:
+    """Return what kind of agent this is: its own `kind` if it has one, else by what it offers."""
+    from rapid.teacher.scripted import SCRIPTED
+
+    if (own := getattr(agent, "kind", None)) in get_args(Kind):
+        return own
+    if callable(getattr(agent, "decide", None)):
+        return "floor" if getattr(agent, "name", "") in SCRIPTED else "teacher"
+    return "planner" if callable(getattr(agent, "bind", None)) else "learned"
 
 
 def driver_for(agent: Any, env: Any, generator_seed: int) -> Driver:

@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +15,9 @@ from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
 from rapid.files import atomic_path
 from rapid.scenarios import ACTIONS
+
+Kind = Literal["floor", "teacher", "planner", "learned"]
+"""What kind of agent: needs no learning, a teacher, search with a perfect model, or learned."""
 
 VEHICLE_LENGTH = 5.0
 """Metres, bumper to bumper, of every vehicle on the road."""
@@ -53,6 +56,7 @@ class EpisodeRow:
     """Which training made the agent; None for what was never trained."""
     commit: str = ""
     """Commit of the source that measured this."""
+    kind: Kind = "learned"
     has_network: bool = False
     """Whether the agent has a network that a gradient attack can use."""
     gradient_attack: bool = False
@@ -65,6 +69,7 @@ SCHEMA = pa.schema(
     [
         ("scenario", pa.string()),
         ("agent", pa.string()),
+        ("kind", pa.string()),
         ("training_seed", pa.int64()),
         ("seed", pa.int64()),
         ("attack", pa.string()),

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 import rapid
 from rapid.errors import RapidError
-from rapid.evaluation.agents import Driver, driver_for
-from rapid.evaluation.metrics import EpisodeRow, time_to_collision
+from rapid.evaluation.agents import Driver, driver_for, kind_of
+from rapid.evaluation.metrics import EpisodeRow, Kind, time_to_collision
 from rapid.evaluation.recording import Recording
 from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS, get_scenario
 from rapid.seeding import torch_stream
@@ -60,6 +60,7 @@ class Episodes:
     """How often each action was taken."""
     decision_seconds: float
     """Wall time of the agent, all decisions together."""
+    kind: Kind = "learned"
     has_network: bool = False
     gradient_attack: bool = False
     recordings: list[Recording] = field(default_factory=list[Recording])
@@ -87,6 +88,7 @@ class Episodes:
                 decision_ms=per_decision,
                 training_seed=training_seed,
                 commit=commit,
+                kind=self.kind,
                 has_network=self.has_network,
                 gradient_attack=self.gradient_attack,
             )
@@ -159,6 +161,7 @@ def run_episodes(
         min_ttc_E=np.where(np.isinf(ttc_E), np.nan, ttc_E),
         counts_EA=joined("counts_BA"),
         decision_seconds=sum(part.decision_seconds for part in parts),
+        kind=kind_of(agent),
         has_network=network is not None,
         gradient_attack=resolved is not None and resolved.needs_gradient,
     )

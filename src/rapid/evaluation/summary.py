@@ -3,13 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-from rapid.evaluation.metrics import EpisodeRow, column
+from rapid.evaluation.metrics import EpisodeRow, Kind, column
 from rapid.evaluation.statistics import ENOUGH_SEEDS, RESAMPLES, Estimate, estimate
 from rapid.scenarios import ACTIONS
 
-Kind = Literal["floor", "teacher", "planner", "learned"]
 KINDS: dict[Kind, str] = {
     "floor": "needs no learning",
     "teacher": "the teacher",
@@ -21,7 +19,7 @@ KINDS: dict[Kind, str] = {
 NOT_APPLICABLE = "n/a"
 NOT_RUN = "–"
 
-_FLOORS = {
+_SHOWN = {
     "slower": "always-slower",
     "idle": "always-idle",
     "faster": "always-faster",
@@ -74,17 +72,9 @@ class SummaryRow:
         return self.kind != "learned"
 
 
-def kind_of(agent: str) -> Kind:
-    """Return what kind of agent goes by this name."""
-    if agent in _FLOORS or agent in _FLOORS.values():
-        return "floor"
-    word = agent.split("-")[0].split(":")[0].split(" ")[0].lower()
-    return "teacher" if word == "teacher" else "planner" if word == "planner" else "learned"
-
-
 def label_of(agent: str) -> str:
     """Return an agent's name as shown: ``slower`` is ``always-slower``."""
-    return _FLOORS.get(agent, agent)
+    return _SHOWN.get(agent, agent)
 
 
 def summarize(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[SummaryRow]:
@@ -102,7 +92,7 @@ def summarize(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[Su
             scenario=scenario,
             agent=agent,
             label=label_of(agent),
-            kind=kind_of(agent),
+            kind=next(row.kind for of in by_attack.values() for row in of),
             metrics=_metrics(by_attack.get(CLEAN, []), resamples),
             shares=_shares(by_attack.get(CLEAN, [])),
             attacks={name: _cell(by_attack, name, needs, resamples) for name, needs in gradient.items()},
