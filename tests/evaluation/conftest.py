@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from worlds import ToyWorlds
+from toy_worlds import ToyWorlds
 
 import rapid
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,9 @@ def kind_of(agent: Any) -> Kind:
     """Return what kind of agent this is: its own `kind` if it has one, else by what it offers."""
     from rapid.teacher.scripted import SCRIPTED
 
-    if (own := getattr(agent, "kind", None)) in get_args(Kind):
-        return own
+    own = getattr(agent, "kind", None)
+    if own in get_args(Kind):
+        return cast(Kind, own)
     if callable(getattr(agent, "decide", None)):
         return "floor" if getattr(agent, "name", "") in SCRIPTED else "teacher"
     return "planner" if callable(getattr(agent, "bind", None)) else "learned"

@@ -1,0 +1,167 @@
+"""Worlds under way side by side, and what is measured of them step by step."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rapid.errors import RapidError
+from rapid.evaluation.agents import Driver
+from rapid.evaluation.metrics import time_to_collision
+from rapid.evaluation.recording import Recording
+from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS
+from rapid.seeding import torch_stream
+
+
+class AttackLike(Protocol):
+    """What an attack must be (see `rapid.attacks`)."""
+
+    @property
+    def needs_gradient(self) -> bool:
+        """Whether the agent's network is differentiated."""
+        ...
+
+    def __call__(self, network: Any, obs_BVF: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Return what the agent sees instead."""
+        ...
+
+
+class Perturbation:
+    """An attack, the network it reads and one stream of noise per episode."""
+
+    def __init__(
+        self, attack: AttackLike | None, network: torch.nn.Module | None, seed: int, spawns: NDArray[np.int64]
+    ) -> None:
+        self.attack, self.network = attack, network
+        self._batch = torch_stream(seed, "attack/batch")
+        self._streams = [torch_stream(seed, f"attack/{spawn}") for spawn in spawns] if attack is not None else []
+
+    def __call__(self, obs_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> NDArray[np.float32]:
+        if self.attack is None:
+            return obs_BVF
+        obs = torch.from_numpy(np.ascontiguousarray(obs_BVF))
+        if self.attack.needs_gradient and self.network is not None:
+            device = next(self.network.parameters()).device
+            seen = self.attack(self.network, obs.to(device), self._batch)
+        else:
+            each = [self.attack(self.network, obs[i : i + 1], self._streams[world]) for i, world in enumerate(worlds)]
+            seen = torch.cat(each)
+        return seen.detach().cpu().numpy().astype(np.float32, copy=False)
+
+
+class Worlds:
+    """B worlds under way and what has been measured of them; a finished one counts no further."""
+
+    def __init__(self, seed_B: NDArray[np.int64], record: bool) -> None:
+        count = len(seed_B)
+        self.seed_B = seed_B
+        self.return_B, self.speed_B, self.distance_B = (np.zeros(count) for _ in range(3))
+        self.length_B, self.lane_changes_B = (np.zeros(count, np.int64) for _ in range(2))
+        self.crashed_B = np.zeros(count, np.bool_)
+        self.ttc_B = np.full(count, np.inf)
+        self.counts_BA = np.zeros((count, NUM_ACTIONS), np.int64)
+        self.decision_seconds = 0.0
+        self._steps: list[list[_Step]] | None = [[] for _ in range(count)] if record else None
+
+    def drive(
+        self,
+        env: Any,
+        driver: Driver,
+        perturb: Perturbation,
+        lanes: int,
+        progress: Callable[[float], None] | None,
+    ) -> None:
+        """Step all worlds until every one has ended."""
+        obs_BVF, _ = env.reset(seed=self.seed_B.tolist())
+        obs_BVF = np.array(obs_BVF, np.float32)
+        start_B = obs_BVF[:, 0, 1].astype(np.float64)
+        lane_B = _lane(obs_BVF, lanes)
+        self.ttc_B = np.minimum(self.ttc_B, time_to_collision(obs_BVF))
+        alive_B = np.ones(len(self.seed_B), np.bool_)
+        step = 0
+        while alive_B.any():
+            worlds = np.flatnonzero(alive_B)
+            seen_BVF = obs_BVF.copy()
+            seen_BVF[worlds] = perturb(obs_BVF[worlds], worlds)
+            began = time.perf_counter()
+            chosen = driver.choose(seen_BVF, worlds, self.seed_B, step)
+            self.decision_seconds += time.perf_counter() - began
+            self._check(chosen, len(worlds))
+            action_B = np.full(len(self.seed_B), IDLE, np.int64)
+            action_B[worlds] = chosen
+            if self._steps is not None:
+                said = driver.commentary(seen_BVF, worlds)
+                for i, world in enumerate(worlds):
+                    self._steps[world].append(_Step(obs_BVF[world].copy(), int(chosen[i]), *said[i]))
+            # Copied: an environment may write its next observation into the same memory.
+            obs_BVF, reward_B, terminated_B, truncated_B, info = env.step(action_B)
+            obs_BVF = np.array(obs_BVF, np.float32)
+            self.return_B[worlds] += np.asarray(reward_B, np.float64)[worlds]
+            self.length_B[worlds] += 1
+            self.counts_BA[worlds, chosen] += 1
+            self.crashed_B[worlds] = np.asarray(info["crashed"], np.bool_)[worlds]
+            self.speed_B[worlds] += np.asarray(info["speed"], np.float64)[worlds]
+            self.distance_B[worlds] = obs_BVF[worlds, 0, 1] - start_B[worlds]
+            new_lane_B = _lane(obs_BVF, lanes)
+            self.lane_changes_B[worlds] += (new_lane_B != lane_B)[worlds]
+            lane_B = new_lane_B
+            self.ttc_B[worlds] = np.minimum(self.ttc_B[worlds], time_to_collision(obs_BVF[worlds]))
+            if self._steps is not None:
+                for world in worlds:
+                    last = self._steps[world][-1]
+                    last.reward, last.after = float(reward_B[world]), obs_BVF[world].copy()
+            ended_B = alive_B & (np.asarray(terminated_B, np.bool_) | np.asarray(truncated_B, np.bool_))
+            alive_B &= ~ended_B
+            if progress is not None and ended_B.any():
+                progress(int(ended_B.sum()))
+            step += 1
+
+    @staticmethod
+    def _check(chosen: NDArray[np.int64], expected: int) -> None:
+        if chosen.shape != (expected,) or (chosen < 0).any() or (chosen >= NUM_ACTIONS).any():
+            raise RapidError(
+                f"The agent answered {chosen.tolist()!r} for {expected} worlds; expected as many actions, each one of "
+                f"{', '.join(f'{i} {name}' for i, name in enumerate(ACTIONS))}."
+            )
+
+    def recordings(self, agent: str, scenario: str, attack: str) -> list[Recording]:
+        """Return the recorded episodes, if any."""
+        found: list[Recording] = []
+        for world, steps in enumerate(self._steps or []):
+            values = [step.q_A for step in steps]
+            found.append(
+                Recording(
+                    agent=agent,
+                    scenario=scenario,
+                    seed=int(self.seed_B[world]),
+                    attack=attack,
+                    obs_TVF=np.stack([*(step.before for step in steps), steps[-1].after]),
+                    action_T=np.array([step.action for step in steps], np.int64),
+                    reward_T=np.array([step.reward for step in steps], np.float64),
+                    crashed=bool(self.crashed_B[world]),
+                    q_TA=np.stack([q for q in values if q is not None]) if values[0] is not None else None,
+                    explanations=tuple(step.said for step in steps) if any(step.said for step in steps) else (),
+                )
+            )
+        return found
+
+
+@dataclass
+class _Step:
+    """One decision of one world, while it is recorded."""
+
+    before: NDArray[np.float32]
+    action: int
+    q_A: NDArray[np.float32] | None
+    said: str
+    reward: float = 0.0
+    after: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+
+def _lane(obs_BVF: NDArray[np.float32], lanes: int) -> NDArray[np.int64]:
+    """Return the lane each ego is nearest to; lanes are 4 m wide and their centres at 0, 4, 8 m."""
+    return np.clip(np.rint(obs_BVF[:, 0, 2] / 4.0), 0, lanes - 1).astype(np.int64)
