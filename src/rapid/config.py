@@ -89,6 +89,8 @@ class MixConfig:
     """Share of teacher transitions."""
     size: int = 15_000
     """Number of transitions in the mixture."""
+    level: Literal["transition", "batch"] = "transition"
+    """`transition` draws the mixture once; `batch` keeps up to `size` of each source and mixes in every batch."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,9 @@ class NetworkConfig:
     heads: int = 4
     """Attention heads."""
     layers: int = 2
-    """L: transformer layers of a policy and of the decoder."""
+    """L: transformer layers of a policy."""
+    decoder_layers: int = 1
+    """Transformer layers of the decoder; of its last only the token that is read is computed."""
     feedforward: int = 128
     """Width of the feed-forward layers."""
     hidden: tuple[int, ...] = (256, 256)
@@ -174,7 +178,8 @@ class OptimizerConfig:
     """Gradient steps, shared by both training phases."""
 
     algorithm: Literal["dqn", "bc"] = "dqn"
-    """`dqn` minimises the loss above (DQN, DDQN and CQL are its settings); `bc` is behaviour cloning."""
+    """`dqn` minimises the loss above (DQN, DDQN and CQL are its settings); `bc` is behaviour cloning, of the
+    transitions that `loss.robust_on` names."""
     learning_rate: float = 5e-4
     """Adam's step size."""
     linear_decay: bool = True
@@ -310,7 +315,7 @@ def _paper(config: Config) -> Config:
     optimizer = OptimizerConfig(linear_decay=False, batch_size=32, target_update=50, target_rate=1.0, max_grad_norm=0.0)
     return replace(
         config,
-        network=NetworkConfig(input="raw", position="learned", mask_absent=False),
+        network=NetworkConfig(decoder_layers=2, input="raw", position="learned", mask_absent=False),
         distill=DistillConfig(iterations=5_000, loss=loss, optimizer=optimizer),
         adapt=AdaptConfig(
             learning_starts=32,
@@ -444,6 +449,7 @@ def validate(config: Config) -> Config:
             f"between 1 and network.num_policies = {network.num_policies}",
         ),
         (network.layers >= 1, "network.layers", network.layers, "at least 1"),
+        (network.decoder_layers >= 1, "network.decoder_layers", network.decoder_layers, "at least 1"),
         (
             network.heads >= 1 and network.width % network.heads == 0,
             "network.width",

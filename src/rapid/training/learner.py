@@ -1,0 +1,121 @@
+"""One gradient step: network, target network, optimiser and the step's random stream, savable as a whole."""
+
+import copy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rapid.config import LossConfig, OptimizerConfig
+from rapid.data.batch import TransitionBatch
+from rapid.errors import RapidError
+from rapid.losses import behavior_cloning_loss, q_loss
+from rapid.networks.q_network import QNetwork
+
+TERMS = ("td", "conservative", "robust", "total", "grad_norm")
+"""What is recorded of every update; `grad_norm` is before clipping, and 0 where nothing is clipped."""
+
+
+class Learner:
+    """Trains the parameters of `network` that require a gradient; everything else stays as it is, bit for bit.
+
+    Args:
+        network: is trained in place.
+        config: the optimiser.
+        loss: the loss.
+        updates: gradient steps that are planned; the step size falls to zero over them if `config.linear_decay`.
+        generator: for the random start of the inner attack, on the network's device.
+    """
+
+    def __init__(
+        self, network: QNetwork, config: OptimizerConfig, loss: LossConfig, updates: int, generator: torch.Generator
+    ) -> None:
+        self.network, self.config, self.loss, self.planned = network, config, loss, updates
+        self.target = copy.deepcopy(network).requires_grad_(False)
+        self.generator = generator
+        self.updates = 0
+        self._trained: list[Tensor] = [parameter for parameter in network.parameters() if parameter.requires_grad]
+        # The same parameters of both networks; frozen ones never differ.
+        targets = dict(self.target.named_parameters())
+        self._targets: list[Tensor] = [
+            targets[name] for name, parameter in network.named_parameters() if parameter.requires_grad
+        ]
+        self._optimizer = torch.optim.Adam(self._trained, lr=config.learning_rate, fused=True)
+        self._terms: list[Tensor] = []
+
+    @property
+    def learning_rate(self) -> float:
+        """Step size of the next update."""
+        left = 1 - self.updates / max(self.planned, 1) if self.config.linear_decay else 1.0
+        return self.config.learning_rate * max(left, 0.0)
+
+    def update(self, batch: TransitionBatch) -> None:
+        """Take one gradient step on the batch (paper: equation 5)."""
+        if self.config.algorithm == "bc":
+            loss = behavior_cloning_loss(self.network, batch, teacher_only=self.loss.robust_on == "teacher")
+        else:
+            loss = q_loss(self.network, self.target, batch, self.loss, self.generator)
+        self._optimizer.param_groups[0]["lr"] = self.learning_rate
+        self._optimizer.zero_grad()
+        loss.total.backward()
+        norm = torch.zeros_like(loss.total)
+        if self.config.max_grad_norm:
+            norm = torch.nn.utils.clip_grad_norm_(self._trained, self.config.max_grad_norm)
+        self._optimizer.step()
+        self.updates += 1
+        if self.updates % self.config.target_update == 0:
+            self._update_target()
+        # Kept as a tensor: asking for its value would make every step wait for the device.
+        self._terms.append(torch.stack([*loss, norm]).detach())
+
+    @torch.no_grad()
+    def _update_target(self) -> None:
+        # One call for all weights, as torch's own optimisers do it; there is no public name for these.
+        if self.config.target_rate == 1:
+            torch._foreach_copy_(self._targets, self._trained)  # pyright: ignore[reportPrivateUsage]
+        else:
+            torch._foreach_lerp_(self._targets, self._trained, self.config.target_rate)  # pyright: ignore[reportPrivateUsage]
+
+    def means(self) -> dict[str, float]:
+        """Return the mean of every term over the updates since the last call, and forget them; empty after none.
+
+        Raises:
+            RapidError: a term or a weight is not finite; the message says where it began.
+        """
+        if not self._terms:
+            return {}
+        terms_UT = torch.stack(self._terms).cpu()
+        bad_U = ~terms_UT.isfinite().all(1)
+        if bad_U.any():
+            row = int(bad_U.int().argmax())
+            names = [name for name, term in zip(TERMS, terms_UT[row], strict=True) if not term.isfinite()]
+            number = self.updates - len(terms_UT) + row + 1
+            raise RapidError(
+                f"Training stopped at update {number}: {', '.join(names)} is not finite. Lower "
+                "optimizer.learning_rate, or set optimizer.max_grad_norm."
+            )
+        if not all(bool(parameter.isfinite().all()) for parameter in self._trained):
+            raise RapidError(
+                f"Training stopped at update {self.updates}: a weight is not finite. Lower optimizer.learning_rate, or "
+                "set optimizer.max_grad_norm."
+            )
+        self._terms.clear()
+        return dict(zip(TERMS, terms_UT.double().mean(0).tolist(), strict=True))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that `load_state_dict` needs; call `means` first, the recorded terms are not in it."""
+        return {
+            "network": self.network.state_dict(),
+            "target": self.target.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Become as the learner was whose `state_dict` this is."""
+        self.network.load_state_dict(state["network"])
+        self.target.load_state_dict(state["target"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        self.updates = state["updates"]

@@ -1,0 +1,127 @@
+"""Phase 2: distil the teacher's data into the network, offline (paper: section 3.2).
+
+DQN, double DQN, CQL and behaviour cloning are settings of the one loop, for every kind of network.
+"""
+
+import os
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from rapid.config import DistillConfig, LossConfig, to_dict
+from rapid.data.replay import OfflineSampler
+from rapid.data.transitions import TEACHER, Transitions
+from rapid.errors import RapidError
+from rapid.networks.q_network import QNetwork, set_phase
+from rapid.progress import Task
+from rapid.seeding import numpy_stream, torch_stream
+from rapid.training.learner import Learner
+from rapid.training.record import Evaluate, Record, crossed, fingerprint, network_fingerprint
+
+LOG_EVERY = 100
+
+
+def distill(
+    transitions: Transitions,
+    network: QNetwork,
+    config: DistillConfig,
+    directory: str | os.PathLike[str],
+    seed: int,
+    evaluate: Evaluate | None = None,
+    progress: Task | None = None,
+    *,
+    teacher_share: float | None = None,
+    checkpoint_seconds: float = 60.0,
+) -> QNetwork:
+    """Train `network` in place on a fixed dataset and return it; the same call goes on from the last checkpoint.
+
+    Args:
+        transitions: the dataset, teacher and random transitions mixed.
+        network: policy 1, the router and the decoder are trained (phase `distill`).
+        config: iterations, loss, optimiser.
+        directory: where ``metrics.jsonl`` and the checkpoint go.
+        seed: of the batches and the inner attack.
+        evaluate: called every `config.evaluate_every` iterations and at the end.
+        progress: counts iterations.
+        teacher_share: see `Dataset.teacher_share`.
+        checkpoint_seconds: time between two checkpoints.
+
+    Raises:
+        RapidError: an empty dataset, one without what the loss needs, a loss that is not finite (the last good
+            checkpoint stays), or a directory of another training.
+    """
+    check_labels(transitions, config.loss, config.optimizer.algorithm)
+    device = str(next(network.parameters()).device)
+    set_phase(network, "distill")
+    record = Record(
+        directory,
+        {
+            "phase": "distill",
+            "config": to_dict(config),
+            "network": to_dict(network.config),
+            "weights": network_fingerprint(network),
+            "data": data_fingerprint(transitions),
+            "teacher_share": teacher_share,
+            "seed": seed,
+        },
+        checkpoint_seconds,
+    )
+    sampler = OfflineSampler(transitions, config.loss.discount, config.loss.n_step, device, teacher_share)
+    rng = numpy_stream(seed, "distill/batches")
+    learner = Learner(
+        network, config.optimizer, config.loss, config.iterations, torch_stream(seed, "distill/attack", device)
+    )
+
+    def state() -> dict[str, Any]:
+        return {"learner": learner.state_dict(), "rng": rng.bit_generator.state}
+
+    if (saved := record.resume()) is not None:
+        learner.load_state_dict(saved["learner"])
+        rng.bit_generator.state = saved["rng"]
+        if progress:
+            progress.skip(learner.updates)
+
+    while learner.updates < config.iterations:
+        learner.update(sampler.sample(config.optimizer.batch_size, rng))
+
+        done = learner.updates
+        last = done == config.iterations
+        measure = last or crossed(done, 1, config.evaluate_every)
+        if not measure and not crossed(done, 1, LOG_EVERY):
+            continue
+        row = {"iteration": done, **learner.means(), "learning_rate": learner.learning_rate, "seconds": record.seconds}
+        if evaluate and measure and config.evaluate_every:
+            row["evaluation"] = evaluate(network, done)
+        record.write(row)
+        record.checkpoint(state, now=last)
+        if progress:
+            progress.advance(done - progress.done)
+            progress.note(f"loss {row['total']:.3g}")
+    return network
+
+
+def check_labels(transitions: Transitions, loss: LossConfig, algorithm: str) -> None:
+    """Raise unless the data has what the loss is built on.
+
+    Raises:
+        RapidError: no transitions, no transition of a teacher, or no action probabilities, where they are needed.
+    """
+    if not len(transitions):
+        raise RapidError("The dataset is empty. Collect transitions first.")
+    needed = algorithm == "bc" or loss.robust_weight > 0
+    if needed and loss.robust_on == "teacher" and not (transitions.source_N == TEACHER).any():
+        raise RapidError(
+            "The loss needs transitions of the teacher (loss.robust_on is 'teacher'), but the dataset has none. Set "
+            "loss.robust_on to 'all', or mix in the teacher's data."
+        )
+    if loss.robust_weight > 0 and loss.robust_labels == "soft" and np.isnan(transitions.probabilities_NA).all():
+        raise RapidError(
+            "The loss needs the teacher's action probabilities (loss.robust_labels is 'soft'), but the dataset has "
+            "none. Set loss.robust_labels to 'hard', or collect with a teacher that gives them."
+        )
+
+
+def data_fingerprint(transitions: Transitions) -> str:
+    """Return the SHA-256 of all arrays."""
+    return fingerprint(getattr(transitions, field.name) for field in fields(transitions))

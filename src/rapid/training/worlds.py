@@ -1,0 +1,91 @@
+"""The worlds that phase 3 drives in, and how it chooses actions there."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rapid.networks.q_network import QNetwork
+from rapid.scenarios import NUM_ACTIONS
+from rapid.seeding import stream_seed
+from rapid.spawns import train_part
+
+MakeWorlds = Callable[[int], Any]
+"""Gives a vector environment of so many worlds with SAME_STEP autoreset."""
+
+
+def epsilon_greedy(
+    network: QNetwork, obs_WVF: NDArray[np.float32], epsilon: float, rng: np.random.Generator, device: str
+) -> NDArray[np.int64]:
+    """Return the greedy action of each world or, with probability `epsilon`, a uniformly random one."""
+    explores_W = rng.random(len(obs_WVF)) < epsilon
+    action_W = rng.integers(NUM_ACTIONS, size=len(obs_WVF))
+    if not explores_W.all():
+        with torch.inference_mode():
+            greedy_W = network(torch.from_numpy(obs_WVF).to(device)).argmax(1).cpu().numpy()
+        action_W = np.where(explores_W, action_W, greedy_W)
+    return action_W
+
+
+class Drive:
+    """The worlds that are driven in, with the returns of the episodes that end in them."""
+
+    def __init__(self, make_worlds: MakeWorlds, count: int, seed: int) -> None:
+        self._worlds = make_worlds(count)
+        part = train_part("online")
+        # Each training begins elsewhere in the set; later episodes go on with each world's own stream.
+        first = stream_seed(seed, "adapt/traffic") % (len(part) - count)
+        obs_WVF, _ = self._worlds.reset(seed=list(part[first : first + count]))
+        self.obs_WVF: NDArray[np.float32] = np.asarray(obs_WVF, np.float32)
+        self._return_W = np.zeros(count)
+        self._ended: list[tuple[float, bool]] = []
+
+    def step(self, action_W: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
+        """Step every world once; return what `ReplayBuffer.add` takes."""
+        before_WVF = self.obs_WVF
+        after_WVF, reward_W, terminated_W, truncated_W, info = self._worlds.step(action_W)
+        self.obs_WVF = np.asarray(after_WVF, np.float32)
+        self._return_W += reward_W
+        next_WVF = self.obs_WVF
+        ended = np.flatnonzero(terminated_W | truncated_W)
+        if len(ended):
+            # There the observation is already the first of the next episode.
+            next_WVF = self.obs_WVF.copy()
+            for world in ended:
+                next_WVF[world] = info["final_obs"][world]
+                self._ended.append((float(self._return_W[world]), bool(terminated_W[world])))
+            self._return_W[ended] = 0
+        return before_WVF, action_W, reward_W, next_WVF, terminated_W, truncated_W
+
+    def means(self) -> dict[str, float | None]:
+        """Return the episodes that ended since the last call, their mean return and crash share, and forget them."""
+        ended = self._ended
+        self._ended = []
+        if not ended:
+            return {"episodes": 0, "return": None, "crash_share": None}
+        returns, crashes = zip(*ended, strict=True)
+        return {"episodes": len(ended), "return": float(np.mean(returns)), "crash_share": float(np.mean(crashes))}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that `load_state_dict` needs; call `means` first.
+
+        A simulator without snapshots gives none; its worlds then begin new episodes on resuming.
+        """
+        can = hasattr(self._worlds, "snapshot")
+        snapshots = [tuple(self._worlds.snapshot(world)) for world in range(len(self.obs_WVF))] if can else None
+        return {"worlds": snapshots, "obs": self.obs_WVF, "returns": self._return_W}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Put every world back where it was."""
+        if state["worlds"] is None:
+            return
+        for world, saved in enumerate(state["worlds"]):
+            kind = type(self._worlds.snapshot(world))
+            self._worlds.restore(world, kind(*saved))
+        self.obs_WVF, self._return_W = state["obs"], state["returns"]
+
+    def close(self) -> None:
+        """Close the worlds."""
+        self._worlds.close()
