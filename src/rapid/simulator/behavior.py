@@ -9,7 +9,7 @@ Positions are fixed while vehicles act, so neighbours are found through the orde
 import math
 
 from rapid.scenarios import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER
-from rapid.simulator.compile import kernel
+from rapid.simulator.compile import dot, kernel
 from rapid.simulator.spawn import LANE_WIDTH, nearest_speed_index
 from rapid.simulator.state import (
     ACCELERATION,
@@ -21,9 +21,9 @@ from rapid.simulator.state import (
     ORDER,
     RANK,
     SIN,
-    SLIP,
     SPEED,
     SPEED_INDEX,
+    STEERING,
     TARGET_LANE,
     TARGET_SPEED,
     TIMER,
@@ -42,9 +42,7 @@ SPEED_GAIN = 1 / 0.6
 LATERAL_GAIN = 1 / 0.6
 HEADING_GAIN = 1 / 0.2
 MAX_HEADING = math.pi / 4
-# The slip angle is atan(tan(steering) / 2), and steering = atan(2 tan(slip)) is clipped to a third of pi: in terms of
-# the sine of the slip angle that is one clip, at the sine of atan(tan(pi / 3) / 2).
-MAX_SLIP = math.sqrt(3 / 7)
+MAX_STEERING = math.pi / 3
 
 MAX_ACCELERATION = 6.0
 COMFORT_ACCELERATION = 3.0
@@ -140,7 +138,7 @@ def free_acceleration(cars, i, exponent):
 @kernel
 def desired_gap(cars, i, front):
     """Return the distance that vehicle `i` wants to `front`, between their centres."""
-    closing = (cars[VX, i] - cars[VX, front]) * cars[COS, i] + (cars[VY, i] - cars[VY, front]) * cars[SIN, i]
+    closing = dot(cars[VX, i] - cars[VX, front], cars[VY, i] - cars[VY, front], cars[COS, i], cars[SIN, i])
     speed = cars[SPEED, i]
     return GAP_WANTED + speed * TIME_WANTED + speed * closing / TWICE_ROOT
 
@@ -155,15 +153,21 @@ def braking(cars, i, front):
 
 
 @kernel
-def slip_towards(cars, i, lane):
-    """Return the sine of the slip angle with which vehicle `i` steers to the centre of `lane`."""
+def steer_towards(cars, i, lane):
+    """Return the steering angle [rad] with which vehicle `i` heads for the centre of `lane`.
+
+    The tangents could be simplified away, but not without rounding otherwise than highway-env does; and a vehicle that
+    is almost standing amplifies a rounding error a hundredfold per frame.
+    """
     lateral = cars[Y, i] - LANE_WIDTH * lane
     heading = cars[HEADING, i]
     if lateral == 0.0 and heading == 0.0:
         return 0.0
     speed = not_zero(cars[SPEED, i])
     wanted = clip(math.asin(clip(-LATERAL_GAIN * lateral / speed, -1.0, 1.0)), -MAX_HEADING, MAX_HEADING)
-    return clip(HALF_LENGTH / speed * (HEADING_GAIN * wrap_angle(wanted - heading)), -MAX_SLIP, MAX_SLIP)
+    turn = HEADING_GAIN * wrap_angle(wanted - heading)
+    slip = math.asin(clip(HALF_LENGTH / speed * turn, -1.0, 1.0))
+    return clip(math.atan(2.0 * math.tan(slip)), -MAX_STEERING, MAX_STEERING)
 
 
 @kernel
@@ -210,7 +214,7 @@ def _give_way(cars, tags, i):
 def act(cars, tags, settings):
     """Let every vehicle choose its command for this frame, in list order: lane choices are seen by those after."""
     cars[ACCELERATION, 0] = SPEED_GAIN * (cars[TARGET_SPEED, 0] - cars[SPEED, 0])
-    cars[SLIP, 0] = slip_towards(cars, 0, tags[TARGET_LANE, 0])
+    cars[STEERING, 0] = steer_towards(cars, 0, tags[TARGET_LANE, 0])
     for i in range(1, cars.shape[1]):
         if tags[CRASHED, i]:
             continue
@@ -230,7 +234,7 @@ def act(cars, tags, settings):
                     ):
                         tags[TARGET_LANE, i] = side
         target = tags[TARGET_LANE, i]
-        cars[SLIP, i] = slip_towards(cars, i, target)
+        cars[STEERING, i] = steer_towards(cars, i, target)
         acceleration = free - braking(cars, i, ahead)
         if target != lane:
             acceleration = min(acceleration, free - braking(cars, i, vehicle_ahead(cars, tags, i, target)))

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from rapid.simulator.behavior import HALF_LENGTH, ROAD_LENGTH, wrap_angle
-from rapid.simulator.compile import kernel
+from rapid.simulator.compile import dot, kernel
 from rapid.simulator.spawn import LANE_WIDTH
 from rapid.simulator.state import (
     ACCELERATION,
@@ -24,8 +24,8 @@ from rapid.simulator.state import (
     PUSHED,
     RANK,
     SIN,
-    SLIP,
     SPEED,
+    STEERING,
     TIMER,
     VX,
     VY,
@@ -63,30 +63,30 @@ def move(cars, tags, settings):
     for i in range(cars.shape[1]):
         cars[TIMER, i] += dt
         speed = cars[SPEED, i]
-        slip = cars[SLIP, i]
+        steering = cars[STEERING, i]
         acceleration = cars[ACCELERATION, i]
         if tags[CRASHED, i]:
-            slip = 0.0
+            steering = 0.0
             acceleration = -speed
         if speed > TOP_SPEED:
             acceleration = min(acceleration, TOP_SPEED - speed)
         elif speed < -TOP_SPEED:
             acceleration = max(acceleration, -TOP_SPEED - speed)
-        straight = slip == 0.0
-        if straight:
+        slip = 0.0
+        if steering == 0.0:
             cars[X, i] += speed * cars[COS, i] * dt
             cars[Y, i] += speed * cars[SIN, i] * dt
         else:
-            cos_slip = math.sqrt(1.0 - slip * slip)
-            cars[X, i] += speed * (cars[COS, i] * cos_slip - cars[SIN, i] * slip) * dt
-            cars[Y, i] += speed * (cars[SIN, i] * cos_slip + cars[COS, i] * slip) * dt
+            slip = math.atan(0.5 * math.tan(steering))
+            cars[X, i] += speed * math.cos(cars[HEADING, i] + slip) * dt
+            cars[Y, i] += speed * math.sin(cars[HEADING, i] + slip) * dt
         if tags[PUSHED, i]:
             cars[X, i] += cars[PUSH_X, i]
             cars[Y, i] += cars[PUSH_Y, i]
             tags[CRASHED, i] = 1
             tags[PUSHED, i] = 0
-        if not straight:
-            cars[HEADING, i] += speed * slip / HALF_LENGTH * dt
+        if slip != 0.0:
+            cars[HEADING, i] += speed * math.sin(slip) / HALF_LENGTH * dt
             cars[COS, i] = math.cos(cars[HEADING, i])
             cars[SIN, i] = math.sin(cars[HEADING, i])
         speed += acceleration * dt
@@ -116,22 +116,48 @@ def sort_by_x(cars, tags):
 
 
 @kernel
-def _span(cars, i, axis_x, axis_y):
+def corner(cars, i, k):
+    """Return a corner of vehicle `i`: k = 0 to 3 goes rear left, rear right, front right, front left."""
+    along = HALF_LENGTH if k >= 2 else -HALF_LENGTH
+    across = HALF_WIDTH if k in (1, 2) else -HALF_WIDTH
+    cos, sin = cars[COS, i], cars[SIN, i]
+    return cos * along - sin * across + cars[X, i], sin * along + cos * across + cars[Y, i]
+
+
+@kernel
+def normal(cars, i, side):
+    """Return the unit normal of a side of vehicle `i`, from its corners as highway-env computes it."""
+    x_1, y_1 = corner(cars, i, side)
+    x_2, y_2 = corner(cars, i, (side + 1) % 4)
+    x, y = y_1 - y_2, x_2 - x_1
+    length = math.sqrt(dot(x, y, x, y))
+    return x / length, y / length
+
+
+@kernel
+def span(cars, i, axis_x, axis_y):
     """Return the interval that the rectangle of vehicle `i` covers along an axis."""
     low, high = math.inf, -math.inf
-    cos, sin = cars[COS, i], cars[SIN, i]
-    for corner in range(4):
-        along = HALF_LENGTH if corner >= 2 else -HALF_LENGTH
-        across = HALF_WIDTH if corner == 1 or corner == 2 else -HALF_WIDTH
-        x = cos * along - sin * across + cars[X, i]
-        y = sin * along + cos * across + cars[Y, i]
-        place = x * axis_x + y * axis_y
+    for k in range(4):
+        x, y = corner(cars, i, k)
+        place = dot(x, y, axis_x, axis_y)
         low, high = min(low, place), max(high, place)
     return low, high
 
 
 @kernel
-def _interval_distance(low_a, high_a, low_b, high_b):
+def _centre(cars, i):
+    x, y = 0.0, 0.0
+    for k in range(4):
+        corner_x, corner_y = corner(cars, i, k)
+        x += corner_x
+        y += corner_y
+    return x / 4, y / 4
+
+
+@kernel
+def interval_distance(low_a, high_a, low_b, high_b):
+    """Return how far two intervals are apart, negative where they overlap."""
     return low_b - high_a if low_a < low_b else low_a - high_b
 
 
@@ -144,38 +170,28 @@ def _contact(cars, i, j, dt):
     """
     intersect, will_intersect = True, True
     least, push_x, push_y = math.inf, 0.0, 0.0
-    drift_x, drift_y = (cars[VX, i] - cars[VX, j]) * dt, (cars[VY, i] - cars[VY, j]) * dt
-    apart_x, apart_y = cars[X, i] - cars[X, j], cars[Y, i] - cars[Y, j]
+    drift_x, drift_y = cars[VX, i] * dt - cars[VX, j] * dt, cars[VY, i] * dt - cars[VY, j] * dt
+    x_i, y_i = _centre(cars, i)
+    x_j, y_j = _centre(cars, j)
     for edge in range(8):
-        body = i if edge < 4 else j
-        cos, sin = cars[COS, body], cars[SIN, body]
-        # Normals of the edges in the order of the corners: rear, left, front, right side of the rectangle.
-        side = edge % 4
-        if side == 0:
-            axis_x, axis_y = -cos, -sin
-        elif side == 1:
-            axis_x, axis_y = -sin, cos
-        elif side == 2:
-            axis_x, axis_y = cos, sin
-        else:
-            axis_x, axis_y = sin, -cos
-        low_i, high_i = _span(cars, i, axis_x, axis_y)
-        low_j, high_j = _span(cars, j, axis_x, axis_y)
-        if _interval_distance(low_i, high_i, low_j, high_j) > 0:
+        axis_x, axis_y = normal(cars, i if edge < 4 else j, edge % 4)
+        low_i, high_i = span(cars, i, axis_x, axis_y)
+        low_j, high_j = span(cars, j, axis_x, axis_y)
+        if interval_distance(low_i, high_i, low_j, high_j) > 0:
             intersect = False
-        drift = axis_x * drift_x + axis_y * drift_y
+        drift = dot(axis_x, axis_y, drift_x, drift_y)
         if drift < 0:
             low_i += drift
         else:
             high_i += drift
-        distance = _interval_distance(low_i, high_i, low_j, high_j)
+        distance = interval_distance(low_i, high_i, low_j, high_j)
         if distance > 0:
             will_intersect = False
         if not intersect and not will_intersect:
             return False, False, 0.0, 0.0
         if abs(distance) < least:
             least = abs(distance)
-            sign = 1.0 if apart_x * axis_x + apart_y * axis_y > 0 else -1.0
+            sign = 1.0 if dot(x_i - x_j, y_i - y_j, axis_x, axis_y) > 0 else -1.0
             push_x, push_y = sign * axis_x, sign * axis_y
     return intersect, will_intersect, least * push_x, least * push_y
 
@@ -184,7 +200,7 @@ def _contact(cars, i, j, dt):
 def _may_touch(cars, i, j, dt):
     """Whether two vehicles need the exact test: a cheap bound that errs on the side of yes."""
     apart_x, apart_y = cars[X, j] - cars[X, i], cars[Y, j] - cars[Y, i]
-    if math.sqrt(apart_x * apart_x + apart_y * apart_y) > DIAGONAL + cars[SPEED, i] * dt:
+    if math.sqrt(dot(apart_x, apart_y, apart_x, apart_y)) > DIAGONAL + cars[SPEED, i] * dt:
         return False
     drift_x, drift_y = (cars[VX, i] - cars[VX, j]) * dt, (cars[VY, i] - cars[VY, j]) * dt
     cos, sin = cars[COS, i], cars[SIN, i]

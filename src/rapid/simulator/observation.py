@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from rapid.simulator.behavior import ROAD_LENGTH, VEHICLE_LENGTH, clip, wrap_angle
-from rapid.simulator.compile import kernel
+from rapid.simulator.compile import dot, kernel
 from rapid.simulator.spawn import LANE_WIDTH
 from rapid.simulator.state import (
     COS,
@@ -86,7 +86,7 @@ def observe(cars, tags, settings, observation):
     count = 0
     for j in range(1, cars.shape[1]):
         ahead, aside = cars[X, j] - cars[X, 0], cars[Y, j] - cars[Y, 0]
-        if math.sqrt(ahead * ahead + aside * aside) >= SIGHT:
+        if math.sqrt(dot(ahead, aside, ahead, aside)) >= SIGHT:
             continue
         if not settings.see_behind and ahead <= -2 * VEHICLE_LENGTH:
             continue

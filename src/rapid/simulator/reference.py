@@ -4,11 +4,29 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rapid.errors import RapidError
 from rapid.scenarios import Scenario, get_scenario
 from rapid.simulator.settings import merge_config, read_integer
+from rapid.simulator.state import (
+    CAR_ROWS,
+    CRASHED,
+    LANE,
+    ORDER,
+    PUSHED,
+    RANK,
+    SPEED_INDEX,
+    START_X,
+    TAG_ROWS,
+    TARGET_LANE,
+    TIME,
+    WORLD_ENTRIES,
+    Snapshot,
+    X,
+)
+from rapid.simulator.stream import stream_of
 
 
 class ReferenceHighwayEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -129,3 +147,40 @@ def make_reference_vec(
         return env if autoreset else _StandStill(env)
 
     return ReferenceVectorEnv([make] * count, seed, autoreset)
+
+
+def copy_world(highway: Any) -> Snapshot:
+    """Return the state of a highway-env ``HighwayEnv`` as a world of the compiled simulator.
+
+    The distance counts from here, and the random stream is the environment's.
+    """
+    vehicles = highway.road.vehicles
+    cars = np.zeros((CAR_ROWS, len(vehicles)))
+    tags = np.zeros((TAG_ROWS, len(vehicles)), np.int64)
+    world = np.zeros(WORLD_ENTRIES)
+    for i, vehicle in enumerate(vehicles):
+        push = (0.0, 0.0) if vehicle.impact is None else vehicle.impact
+        cars[:, i] = (
+            *vehicle.position,
+            vehicle.heading,
+            vehicle.speed,
+            *vehicle.direction,
+            *vehicle.velocity,
+            vehicle.target_speed,
+            # The ego has neither, and what stands there is never read.
+            getattr(vehicle, "timer", (vehicle.position.sum() * np.pi) % 1.0),
+            getattr(vehicle, "DELTA", 4.0),
+            0.0,  # the command is chosen anew in every frame
+            0.0,
+            *push,
+        )
+        tags[LANE, i] = vehicle.lane_index[2]
+        tags[TARGET_LANE, i] = vehicle.target_lane_index[2]
+        tags[CRASHED, i] = vehicle.crashed
+        tags[PUSHED, i] = vehicle.impact is not None
+    tags[ORDER] = np.argsort(cars[X], kind="stable")
+    tags[RANK, tags[ORDER]] = np.arange(len(vehicles))
+    world[TIME] = highway.time
+    world[START_X] = cars[X, 0]
+    world[SPEED_INDEX] = highway.vehicle.speed_index
+    return Snapshot(cars, tags, world, stream_of(highway.np_random))

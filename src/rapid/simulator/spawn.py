@@ -20,10 +20,10 @@ from rapid.simulator.state import (
     PUSHED,
     RANK,
     SIN,
-    SLIP,
     SPEED,
     SPEED_INDEX,
     START_X,
+    STEERING,
     TARGET_LANE,
     TARGET_SPEED,
     TERMINATED,
@@ -80,7 +80,7 @@ def spawn_world(cars, tags, world, stream, settings):
         cars[TARGET_SPEED, i] = speed
         cars[TIMER, i] = ((x + y) * math.pi) % 1.0
         cars[EXPONENT, i] = 4.0 if i == 0 else uniform(stream, 3.5, 4.5)
-        cars[SLIP, i] = 0.0
+        cars[STEERING, i] = 0.0
         cars[ACCELERATION, i] = 0.0
         cars[PUSH_X, i] = 0.0
         cars[PUSH_Y, i] = 0.0

@@ -15,9 +15,11 @@ from rapid.simulator.stream import STREAM_WORDS
 
 # Rows of `cars` (float64): position [m], heading [rad], speed [m/s], direction and velocity (both follow from heading
 # and speed and are kept because neighbours read them), the driver (speed it wants [m/s], time since it last considered
-# a lane change [s], IDM exponent), the command (sine of the slip angle, acceleration [m/s²]) and the displacement that
+# a lane change [s], IDM exponent), the command (steering [rad], acceleration [m/s²]) and the displacement that
 # a predicted collision applies in the next frame [m].
-X, Y, HEADING, SPEED, COS, SIN, VX, VY, TARGET_SPEED, TIMER, EXPONENT, SLIP, ACCELERATION, PUSH_X, PUSH_Y = range(15)
+X, Y, HEADING, SPEED, COS, SIN, VX, VY, TARGET_SPEED, TIMER, EXPONENT, STEERING, ACCELERATION, PUSH_X, PUSH_Y = range(
+    15
+)
 CAR_ROWS = 15
 
 # Rows of `tags` (int64): lane, lane aimed at, crashed, push pending, vehicle at each rank when sorted by x, rank of
