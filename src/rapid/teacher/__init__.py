@@ -1,0 +1,28 @@
+"""Who drives in phase 1: language models with tools, and scripted drivers (paper: section 3.1).
+
+The way of a decision: observation → :mod:`~rapid.teacher.scene` → :mod:`~rapid.teacher.facts` (closed-form checks and
+the :mod:`~rapid.teacher.forecast`) → :mod:`~rapid.teacher.prompt` → model → :class:`Decision`. Importing this package
+loads no model code.
+"""
+
+from rapid.config import TeacherConfig
+from rapid.teacher.decision import Decision, Teacher, from_record, to_record
+
+__all__ = ["Decision", "Teacher", "from_record", "make_teacher", "to_record"]
+
+
+def make_teacher(config: TeacherConfig, lanes: int, seed: int = 0) -> Teacher:
+    """Return the teacher that `config` describes, for a road with `lanes` lanes.
+
+    `seed` matters to drivers that draw at random; the rest is deterministic.
+
+    Raises:
+        RapidError: a name that does not exist, a model that cannot be had, a recording that cannot be read, no key.
+    """
+    if config.backend == "scripted":
+        from rapid.teacher.scripted import Scripted
+
+        return Scripted(config.model, lanes, seed)
+    from rapid.teacher.agent import make_model_teacher
+
+    return make_model_teacher(config, lanes, seed)

@@ -1,0 +1,107 @@
+"""What a teacher is, and everything that one of its decisions carries."""
+
+import dataclasses
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rapid.errors import RapidError
+from rapid.scenarios import ACTIONS, NUM_ACTIONS
+
+Status = Literal["ok", "repaired", "fallback", "scripted"]
+STATUSES: tuple[str, ...] = typing.get_args(Status)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision and how it came about; :func:`to_record` and :func:`from_record` take it through JSON."""
+
+    action: int
+    """Index into :data:`rapid.scenarios.ACTIONS`."""
+    explanation: str = ""
+    """The reason given; it is fed back at the next step."""
+    answer: str = ""
+    """The answer as the model gave it."""
+    probabilities: tuple[float, ...] | None = None
+    """Soft label: the probability of each of the five actions, where the backend gives it."""
+    prompt_hash: str = ""
+    """SHA-256 of the first prompt; recorded answers are found by it."""
+    status: Status = "scripted"
+    """`ok`; `repaired` after one correction; `fallback` if the rule had to decide; `scripted` without a model."""
+    error: str = ""
+    """What went wrong, where something did."""
+    retries: int = 0
+    """Requests repeated."""
+    tokens_in: int = 0
+    """Prompt tokens read."""
+    tokens_out: int = 0
+    """Answer tokens written."""
+    seconds: float = 0.0
+    """Time taken; in a batch, the batch's time over its size."""
+    cost: float = 0.0
+    """Price, in the currency of the settings."""
+    transcript: str = ""
+    """What was said: the prompt (without the part that never changes) and all turns."""
+
+
+class Teacher(Protocol):
+    """Who drives in phase 1 (paper: section 3.1). Nothing is remembered from call to call but caches."""
+
+    name: str
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies the teacher, ready for JSON: backend, model, hash of the weights, style, prompt."""
+        ...
+
+    def decide(
+        self,
+        obs_BVF: NDArray[np.float32],
+        previous: Sequence[Decision | None],
+        keys_B: NDArray[np.int64] | None = None,
+    ) -> list[Decision]:
+        """Decide for each world.
+
+        Args:
+            obs_BVF: observations as the environment gives them: rows (presence, x, y, vx, vy), the ego first; m, m/s.
+            previous: each world's last decision, or `None` at the first step.
+            keys_B: one number per decision from which a random driver draws, so that nothing depends on batching.
+
+        Raises:
+            RapidError: an observation of the wrong shape or with a number that is not finite.
+        """
+        ...
+
+
+def to_record(decision: Decision) -> dict[str, Any]:
+    """Return the decision as a dictionary for JSON."""
+    return dataclasses.asdict(decision)
+
+
+def from_record(record: dict[str, Any]) -> Decision:
+    """Return the decision that :func:`to_record` took apart.
+
+    Raises:
+        RapidError: fields are missing or unknown, or a value is out of range.
+    """
+    names = {field.name for field in dataclasses.fields(Decision)}
+    if unknown := set(record) - names:
+        raise RapidError(
+            f"A recorded decision has unknown fields {sorted(unknown)}; it comes from another version. Expected "
+            f"{', '.join(sorted(names))}."
+        )
+    action, status = record.get("action"), record.get("status", "scripted")
+    if type(action) is not int or not 0 <= action < NUM_ACTIONS:
+        raise RapidError(f"A recorded decision has action {action!r}; expected 0 to 4 ({', '.join(ACTIONS)}).")
+    if status not in STATUSES:
+        raise RapidError(f"A recorded decision has status {status!r}; expected one of {', '.join(STATUSES)}.")
+    probabilities = record.get("probabilities")
+    if probabilities is not None:
+        probabilities = tuple(float(value) for value in probabilities)
+        if len(probabilities) != NUM_ACTIONS:
+            raise RapidError(f"A recorded decision has {len(probabilities)} probabilities; expected {NUM_ACTIONS}.")
+    values: dict[str, Any] = {**record, "probabilities": probabilities}
+    return Decision(**values)
