@@ -1,0 +1,87 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fake_worlds import assert_equal, fake_transitions
+from rapid.data.tables import from_table, read_parquet, to_table, write_parquet
+from rapid.data.transitions import RANDOM, concatenate, empty
+from rapid.errors import RapidError
+from rapid.spawns import spawn_seeds, train_part
+
+
+@pytest.mark.parametrize("order", ["whole", "shuffled", "thinned", "none"])
+def test_parquet_gives_back_every_bit(tmp_path, order):
+    rows = fake_transitions()
+    index = {
+        "whole": slice(None),
+        "shuffled": np.random.default_rng(0).permutation(len(rows)),
+        "thinned": np.arange(0, len(rows), 3),
+        "none": slice(0),
+    }[order]
+    rows = rows.select(index)
+    write_parquet(to_table(rows), tmp_path / "rows.parquet")
+    assert_equal(from_table(read_parquet(tmp_path / "rows.parquet", "rows")), rows)
+
+
+def test_negative_zero_survives_the_omission_of_repeated_observations():
+    rows = fake_transitions(1)
+    rows.obs_NVF[1, 2, 3], rows.next_obs_NVF[0, 2, 3] = 0.0, -0.0
+    assert np.signbit(from_table(to_table(rows)).next_obs_NVF[0, 2, 3])
+
+
+def test_repeated_observations_are_stored_once():
+    table = to_table(fake_transitions(episodes=4, length=10))
+    assert table.column("next_obs").null_count == 4 * 9
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("obs_NVF", np.nan, "non-finite observation"),
+        ("next_obs_NVF", np.inf, "non-finite next observation"),
+        ("reward_N", np.nan, "non-finite reward"),
+        ("action_N", 5, "action outside 0..4"),
+        ("action_N", -1, "action outside 0..4"),
+        ("source_N", 7, "source outside"),
+        ("probabilities_NA", 0.7, "no distribution"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_row(name, value, message):
+    rows = fake_transitions()
+    array = getattr(rows, name).copy()
+    array[3] = value
+    with pytest.raises(RapidError, match=f"row 3 has .*{message}"):
+        replace(rows, **{name: array}).validate()
+
+
+def test_other_spaces_and_impossible_ends_are_refused():
+    rows = fake_transitions()
+    with pytest.raises(RapidError, match="'obs_NVF' has shape"):
+        replace(rows, obs_NVF=rows.obs_NVF[:, :10]).validate()
+    with pytest.raises(RapidError, match="both terminated and truncated"):
+        replace(rows, terminated_N=rows.done_N, truncated_N=rows.done_N).validate()
+    with pytest.raises(RapidError, match="lost its end"):
+        from_table(to_table(rows)[:5])
+    with pytest.raises(RapidError, match="other columns"):
+        from_table(to_table(rows).drop_columns(["obs"]))
+
+
+def test_concatenation_keeps_episodes_apart():
+    both = concatenate([fake_transitions(3), fake_transitions(2, RANDOM), empty()]).validate()
+    assert sorted(set(both.episode_N.tolist())) == [0, 1, 2, 3, 4]
+    assert both.follows_N().sum() == 5 * 9
+
+
+def test_spawn_sets_are_disjoint_and_end():
+    sets = [set(spawn_seeds(name, count)) for name, count in (("train", 800_000), ("tune", 100_000), ("test", 100_000))]
+    assert len(set().union(*sets)) == 1_000_000
+    assert max(max(part) for part in sets) < 1_000_000
+    parts = [set(train_part(name)) for name in ("teacher", "random", "online")]
+    assert set().union(*parts) == sets[0]
+    assert sum(map(len, parts)) == 800_000
+    assert spawn_seeds("tune", 2, start=5) == [800_005, 800_006]
+    with pytest.raises(RapidError, match="has 100000 spawn seeds"):
+        spawn_seeds("test", 2, start=99_999)
+    with pytest.raises(RapidError, match="did you mean 'test'"):
+        spawn_seeds("tests", 1)
