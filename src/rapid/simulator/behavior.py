@@ -8,11 +8,16 @@ Positions are fixed while vehicles act, so neighbours are found through the orde
 
 import math
 
+import numpy as np
+
 from rapid.scenarios import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER
 from rapid.simulator.compile import dot, kernel
 from rapid.simulator.spawn import LANE_WIDTH, nearest_speed_index
 from rapid.simulator.state import (
     ACCELERATION,
+    AHEAD,
+    AHEAD_LEFT,
+    AHEAD_RIGHT,
     COS,
     CRASHED,
     EXPONENT,
@@ -116,6 +121,48 @@ def vehicle_ahead(cars, tags, i, lane):
 
 
 @kernel
+def look_ahead(cars, tags, settings):
+    """Find for every vehicle the one next ahead on its lane and on the lanes beside it, in one pass from the front."""
+    order, lanes = tags[ORDER], tags[LANE]
+    nearest = np.full(settings.lanes, -1, np.int64)
+    last = len(order) - 1
+    for rank in range(last, -1, -1):
+        i = order[rank]
+        lane, x = lanes[i], cars[X, i]
+        if (rank > 0 and cars[X, order[rank - 1]] == x) or (rank < last and cars[X, order[rank + 1]] == x):
+            # Level with another vehicle: the pass would miss that each of them is ahead of the other.
+            tags[AHEAD, i] = vehicle_ahead(cars, tags, i, lane)
+            tags[AHEAD_LEFT, i] = vehicle_ahead(cars, tags, i, lane - 1)
+            tags[AHEAD_RIGHT, i] = vehicle_ahead(cars, tags, i, lane + 1)
+        else:
+            tags[AHEAD, i] = nearest[lane]
+            tags[AHEAD_LEFT, i] = nearest[lane - 1] if lane > 0 else -1
+            tags[AHEAD_RIGHT, i] = nearest[lane + 1] if lane + 1 < settings.lanes else -1
+        # A vehicle is seen from its own lane and, between two lanes, from the other one as well.
+        if -VEHICLE_LENGTH <= x < ROAD_LENGTH + VEHICLE_LENGTH:
+            y = cars[Y, i]
+            if abs(y - LANE_WIDTH * lane) <= REACH:
+                nearest[lane] = i
+            if lane > 0 and abs(y - LANE_WIDTH * (lane - 1)) <= REACH:
+                nearest[lane - 1] = i
+            if lane + 1 < settings.lanes and abs(y - LANE_WIDTH * (lane + 1)) <= REACH:
+                nearest[lane + 1] = i
+
+
+@kernel
+def _ahead_on(cars, tags, i, lane):
+    """Return the vehicle next ahead of `i` on `lane`, looked up where :func:`look_ahead` found it."""
+    side = lane - tags[LANE, i]
+    if side == 0:
+        return tags[AHEAD, i]
+    if side == -1:
+        return tags[AHEAD_LEFT, i]
+    if side == 1:
+        return tags[AHEAD_RIGHT, i]
+    return vehicle_ahead(cars, tags, i, lane)
+
+
+@kernel
 def vehicle_behind(cars, tags, i, lane):
     """Return the vehicle next behind `i` on `lane` (of several equally far ones the first listed), or -1."""
     found = -1
@@ -188,14 +235,15 @@ def command_ego(cars, tags, world, action, settings):
 @kernel
 def _lane_change_pays(cars, tags, i, lane, free, ahead):
     """Whether MOBIL lets vehicle `i` change to `lane`; its follower there is judged with the exponent of `i`."""
-    behind = vehicle_behind(cars, tags, i, lane)
-    if behind >= 0:
-        imposed = free_acceleration(cars, behind, cars[EXPONENT, i]) - braking(cars, behind, i)
-        if imposed < -MAX_BRAKING_IMPOSED:
-            return False
-    there = free - braking(cars, i, vehicle_ahead(cars, tags, i, lane))
+    there = free - braking(cars, i, _ahead_on(cars, tags, i, lane))
     here = free - braking(cars, i, ahead)
-    return there - here >= MIN_GAIN
+    if there - here < MIN_GAIN:
+        return False
+    behind = vehicle_behind(cars, tags, i, lane)
+    if behind < 0:
+        return True
+    imposed = free_acceleration(cars, behind, cars[EXPONENT, i]) - braking(cars, behind, i)
+    return imposed >= -MAX_BRAKING_IMPOSED
 
 
 @kernel
@@ -213,6 +261,7 @@ def _give_way(cars, tags, i):
 @kernel
 def act(cars, tags, settings):
     """Let every vehicle choose its command for this frame, in list order: lane choices are seen by those after."""
+    look_ahead(cars, tags, settings)
     cars[ACCELERATION, 0] = SPEED_GAIN * (cars[TARGET_SPEED, 0] - cars[SPEED, 0])
     cars[STEERING, 0] = steer_towards(cars, 0, tags[TARGET_LANE, 0])
     for i in range(1, cars.shape[1]):
@@ -220,7 +269,7 @@ def act(cars, tags, settings):
             continue
         lane = tags[LANE, i]
         free = free_acceleration(cars, i, cars[EXPONENT, i])
-        ahead = vehicle_ahead(cars, tags, i, lane)
+        ahead = tags[AHEAD, i]
         if tags[TARGET_LANE, i] != lane:
             _give_way(cars, tags, i)
         elif cars[TIMER, i] > LANE_CHANGE_DELAY:
@@ -237,5 +286,5 @@ def act(cars, tags, settings):
         cars[STEERING, i] = steer_towards(cars, i, target)
         acceleration = free - braking(cars, i, ahead)
         if target != lane:
-            acceleration = min(acceleration, free - braking(cars, i, vehicle_ahead(cars, tags, i, target)))
+            acceleration = min(acceleration, free - braking(cars, i, _ahead_on(cars, tags, i, target)))
         cars[ACCELERATION, i] = clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)

@@ -61,4 +61,4 @@ def _fused(typingctx, a, b, c):
 @kernel
 def dot(a_x, a_y, b_x, b_y):
     """Return the inner product of two plane vectors, rounded as NumPy's BLAS rounds it."""
-    return _fused(a_y, b_y, a_x * b_x)
+    return _fused(a_y, b_y, a_x * b_x)  # pyright: ignore[reportCallIssue]  # numba passes the first argument

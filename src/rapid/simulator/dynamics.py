@@ -99,7 +99,7 @@ def move(cars, tags, settings):
 @kernel
 def sort_by_x(cars, tags):
     """Restore the order by x, ties by list order; vehicles rarely overtake, so insertion sort is linear here."""
-    order = tags[ORDER]
+    order, ranks = tags[ORDER], tags[RANK]
     for rank in range(1, len(order)):
         i = order[rank]
         x = cars[X, i]
@@ -109,10 +109,11 @@ def sort_by_x(cars, tags):
             if cars[X, j] < x or (cars[X, j] == x and j < i):
                 break
             order[place] = j
+            ranks[j] = place
             place -= 1
-        order[place] = i
-    for rank in range(len(order)):
-        tags[RANK, order[rank]] = rank
+        if place < rank:
+            order[place] = i
+            ranks[i] = place
 
 
 @kernel
@@ -200,6 +201,8 @@ def _contact(cars, i, j, dt):
 def _may_touch(cars, i, j, dt):
     """Whether two vehicles need the exact test: a cheap bound that errs on the side of yes."""
     apart_x, apart_y = cars[X, j] - cars[X, i], cars[Y, j] - cars[Y, i]
+    if cars[SIN, i] == 0.0 and cars[SIN, j] == 0.0 and abs(apart_y) > 2 * HALF_WIDTH + 1e-6:
+        return False  # side by side on straight courses: the usual case
     if math.sqrt(dot(apart_x, apart_y, apart_x, apart_y)) > DIAGONAL + cars[SPEED, i] * dt:
         return False
     drift_x, drift_y = (cars[VX, i] - cars[VX, j]) * dt, (cars[VY, i] - cars[VY, j]) * dt

@@ -23,9 +23,9 @@ X, Y, HEADING, SPEED, COS, SIN, VX, VY, TARGET_SPEED, TIMER, EXPONENT, STEERING,
 CAR_ROWS = 15
 
 # Rows of `tags` (int64): lane, lane aimed at, crashed, push pending, vehicle at each rank when sorted by x, rank of
-# each vehicle.
-LANE, TARGET_LANE, CRASHED, PUSHED, ORDER, RANK = range(6)
-TAG_ROWS = 6
+# each vehicle, and, within a frame, the vehicle next ahead on the lane to the left, on the own, and to the right.
+LANE, TARGET_LANE, CRASHED, PUSHED, ORDER, RANK, AHEAD_LEFT, AHEAD, AHEAD_RIGHT = range(9)
+TAG_ROWS = 9
 
 # Entries of `world` (float64): time since reset [s], the ego's x at reset [m], index of the ego's target speed, and
 # whether the episode has ended.
