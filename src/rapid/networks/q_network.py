@@ -44,13 +44,13 @@ class ActionDecoder(nn.Module):
         super().__init__()
         prepend = config.action_token == "prepend"
         self.action_token = nn.Parameter(torch.empty(1, 1, config.width)) if prepend else None
-        self.transformer = Transformer(config.layers, config.width, config.heads, config.feedforward)
+        self.transformer = Transformer(config.decoder_layers, config.width, config.heads, config.feedforward)
         self.head = nn.Linear(config.width, NUM_ACTIONS)
 
     def forward(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> Tensor:
         """Return the Q-values (B, A)."""
         tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V)
-        return self.head(self.transformer(tokens_BTD, mask_B11T, first_only=True)[:, 0])
+        return self.head(self.transformer(tokens_BTD, mask_B11T, first_only=True))
 
     def attention(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> Tensor:
         """Return the attention of the token that is read to the vehicles (B, L, H, V)."""
@@ -154,9 +154,10 @@ def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
             f"A network with num_policies N = {config.num_policies} and top_k K = {config.top_k} cannot be built: "
             "N must be at least 1 and K between 1 and N."
         )
-    if config.heads < 1 or config.width % config.heads or config.layers < 1:
+    if config.heads < 1 or config.width % config.heads or min(config.layers, config.decoder_layers) < 1:
         raise RapidError(
-            f"A network of width {config.width} with {config.heads} heads and {config.layers} layers cannot be built: "
+            f"A network of width {config.width} with {config.heads} heads and {config.layers} + "
+            f"{config.decoder_layers} layers cannot be built: "
             "the width must be a multiple of the heads, with at least one head and one layer."
         )
     # The constructors draw from the global stream; every such value is overwritten below, so its state is kept.
