@@ -1,0 +1,251 @@
+"""The page: complete, self-contained, closed to what untrusted text might try, and calm when parts are missing."""
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rapid.config import preset, to_dict
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import EpisodeRow
+from rapid.evaluation.recording import Recording
+from rapid.report import ReportData, RoutingSnapshot, text_summary, write_figures, write_report
+from rapid.report.curves import UNIFORM, charts, moving_picture, series
+from rapid.report.markup import script_json, tag, text
+from rapid.report.page import page
+
+SCENARIO = "lane-3-density-2"
+HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)> \u2028\u2029 & \"'`{{payload}} \ud800 <!--"
+VOID = {"meta", "img", "br", "input", "hr", "link"}
+
+
+def rows(agent: str, attack: str = "none", seeds: int = 8, **changes) -> list[EpisodeRow]:
+    return [
+        EpisodeRow(
+            scenario=SCENARIO,
+            agent=agent,
+            seed=seed,
+            attack=attack,
+            episode_return=15.0 + seed,
+            length=30,
+            crashed=seed == 0,
+            mean_speed=20.0,
+            distance=600.0,
+            lane_changes=2,
+            min_ttc=3.0,
+            shares=(0.1, 0.5, 0.1, 0.2, 0.1),
+            **changes,
+        )
+        for seed in range(seeds)
+    ]
+
+
+def recording(said: str = "the lane is free", q: bool = True) -> Recording:
+    obs = np.zeros((4, 15, 5), np.float32)
+    for t in range(4):
+        obs[t, 0] = (1, 100 + 20 * t, 4, 20, 0)
+        obs[t, 1] = (1, 130 + 15 * t, 0, 15, 0)
+    values = np.array([[1, 2, 3, np.nan, 5]] * 3, np.float32) if q else None
+    return Recording(
+        "teacher",
+        SCENARIO,
+        900_000,
+        "none",
+        obs,
+        np.array([0, 3, 4]),
+        np.array([0.5, 0.6, np.nan]),
+        True,
+        values,
+        (said,) * 3,
+    )
+
+
+def full(hostile: str = "plain") -> ReportData:
+    distill = [{"iteration": i, "td": 1 / i, "robust": 1.6 / i, "evaluation": {"return": i}} for i in range(1, 30)]
+    adapt = [{"step": i, "gate": i / 100, "agreement": None, "evaluation": {"return": i}} for i in range(1, 30)]
+    return ReportData(
+        title=hostile,
+        settings=to_dict(preset()) | {"note": hostile},
+        versions={"torch": "2", hostile: hostile},
+        commit=hostile,
+        command=hostile,
+        timings={"collect": 10.0, hostile: 5.0},
+        rows=[
+            *rows("slower", kind="floor"),
+            *rows(hostile, kind="teacher", seeds=1),
+            *rows("RAPID", training_seed=0, has_network=True),
+            *rows("RAPID", "pgd", training_seed=0, has_network=True, gradient_attack=True),
+            *rows("RAPID", hostile, training_seed=0, has_network=True),
+        ],
+        distill={"distilled": distill, hostile: distill},
+        adapt={"RAPID": adapt},
+        routing=[RoutingSnapshot(hostile, np.tile([0.7, -0.2], (15, 1)).astype(np.float32), recording().obs_TVF[0])],
+        recordings=[recording(hostile), recording(q=False)],
+        dataset={"transitions": 4000, hostile: {"p": 0.25, "answer": hostile}},
+        notes=[hostile],
+    )
+
+
+class Reader(HTMLParser):
+    """Reads a page as a browser does: tags must close in order; scripts, attributes and text are kept."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.scripts: list[str] = []
+        self.feed(content)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data) -> None:
+        if self.open and self.open[-1] == "script":
+            self.scripts.append(data)
+        elif self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+
+@pytest.mark.parametrize("hostile", ["plain", HOSTILE])
+def test_page_is_well_formed_and_whole(hostile: str) -> None:
+    content = page(full(hostile))
+    reader = Reader(content)
+    ids = {attributes["id"] for _, attributes in reader.tags if attributes.get("id")}
+    assert {"results", "watch", "attacks", "curves", "routing", "dataset", "made-by", "payload"} <= ids
+    assert [name for name, _ in reader.tags].count("script") == 2
+    payload = json.loads(reader.scripts[0])
+    assert len(payload["episodes"]) == 2
+    words = " ".join(reader.words)
+    for expected in ("always-slower", "20.42", "14.77", "n/a", "on this road ε = 0.1 means up to 20 m", "1.2 m across"):
+        assert expected in words
+
+
+def test_text_of_others_stays_text() -> None:
+    content = page(full(HOSTILE))
+    reader = Reader(content)
+    clean = HOSTILE.replace("\ud800", "?")
+    assert json.loads(reader.scripts[0])["episodes"][0]["said"] == [clean] * 3
+    assert clean in " ".join(reader.words)
+    assert not any(name == "img" or any(key.startswith("on") for key in attributes) for name, attributes in reader.tags)
+    assert "\u2028" not in reader.scripts[0]
+    assert "<" not in reader.scripts[0]
+    content.encode("utf-8")
+
+
+def test_page_asks_the_network_for_nothing() -> None:
+    content = page(full())
+    reader = Reader(content)
+    for _, attributes in reader.tags:
+        assert "src" not in attributes
+        assert "href" not in attributes
+    assert "@import" not in content
+    assert "url(" not in content
+    links = set(re.findall(r"https?://[^\s\"'<\\]+", content))
+    # The first is a name that SVG needs, the second a default of the settings, shown as text.
+    assert links <= {"http://www.w3.org/2000/svg", "http://127.0.0.1:8000/v1"}
+
+
+def test_only_its_own_script_may_run() -> None:
+    reader = Reader(page(full(HOSTILE)))
+    policy = next(
+        a["content"] for n, a in reader.tags if n == "meta" and a.get("http-equiv") == "Content-Security-Policy"
+    )
+    digest = base64.b64encode(hashlib.sha256(reader.scripts[1].encode()).digest()).decode()
+    assert policy is not None
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "default-src 'none'" in policy
+
+
+def test_missing_parts_are_said_to_be_missing(tmp_path: Path) -> None:
+    path = write_report(ReportData(title="empty"), tmp_path)
+    reader = Reader(path.read_text(encoding="utf-8"))
+    assert path == (tmp_path / "report.html").resolve()
+    missing = [attributes for _, attributes in reader.tags if attributes.get("class") == "missing"]
+    assert len(missing) >= 8
+    assert json.loads(reader.scripts[0])["episodes"] == []
+    assert write_figures(ReportData(title="empty"), tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "part", ["rows", "distill", "adapt", "routing", "recordings", "dataset", "timings", "settings"]
+)
+def test_each_part_may_be_missing_by_itself(part: str) -> None:
+    Reader(page(replace(full(), **{part: type(getattr(full(), part))()})))
+
+
+def test_unwritable_place(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RapidError, match="Cannot write"):
+        write_report(ReportData(title="x"), tmp_path / "file" / "report.html")
+
+
+def test_verdict_needs_five_trainings() -> None:
+    one = ReportData(title="x", rows=rows("RAPID", training_seed=0))
+    assert "insufficient" in page(one)
+    many = [row for seed in range(5) for row in rows("RAPID", training_seed=seed)]
+    assert "our interval lies" in page(ReportData(title="x", rows=many))
+
+
+def test_paper_is_not_beside_another_reward() -> None:
+    other = [replace(row, scenario=f"{SCENARIO}:progress") for row in rows("RAPID", training_seed=0)]
+    assert "20.42" not in page(ReportData(title="x", rows=other))
+
+
+def test_uniform_policy_is_marked_on_the_robust_curve_only() -> None:
+    drawn = {chart["id"]: chart for chart in charts(full().distill, full().adapt)}
+    assert pytest.approx(1.609, abs=1e-3) == UNIFORM
+    assert drawn["robust"]["marks"][0]["y"] == UNIFORM
+    assert drawn["distill-return"]["marks"] == []
+    assert "agreement" not in drawn  # only nulls
+
+
+def test_a_term_that_was_left_out_is_not_drawn_as_zero_but_no_crashes_are() -> None:
+    entries = [{"iteration": i, "robust": 0.0, "evaluation": {"crash_share": 0.0}} for i in range(3)]
+    assert {chart["id"] for chart in charts({"dqn": entries}, {})} == {"distill-crash"}
+
+
+def test_long_series_are_averaged() -> None:
+    points = series([{"step": i, "td": i} for i in range(10_000)], "td")
+    assert len(points) == 400
+    assert points[0] == (12.0, 12.0)
+
+
+def test_moving_picture_keeps_names_and_ranks() -> None:
+    picture = moving_picture(recording())
+    assert picture["frames"][2][1] == [1, 1, 160.0, 0.0, 15.0, 0.0]
+    assert picture["lanes"] == 3
+    assert json.loads(script_json(picture))["rewards"][2] is None
+
+
+def test_markup_escapes_text_and_attributes() -> None:
+    assert tag("p", "<b>", tag("i", "x"), title='"<', data_value=1) == (
+        '<p title="&quot;&lt;" data-value="1">&lt;b&gt;<i>x</i></p>'
+    )
+    assert text("\0\ud800") == "\ufffd?"
+    assert script_json({"a": float("nan"), "b": "</script>&\u2028"}) == (
+        '{"a":null,"b":"\\u003c/script\\u003e\\u0026\\u2028"}'
+    )
+
+
+def test_figures(tmp_path: Path) -> None:
+    paths = write_figures(full(), tmp_path)
+    assert [path.name for path in paths] == ["results.png", "curves.png", "episode.png"]
+    assert all(path.read_bytes()[:4] == b"\x89PNG" for path in paths)
+
+
+def test_text_summary() -> None:
+    assert "always-slower" in text_summary(full().rows)
