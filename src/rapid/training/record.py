@@ -122,3 +122,16 @@ def fingerprint(arrays: Iterable[NDArray[Any]]) -> str:
 def network_fingerprint(network: QNetwork) -> str:
     """Return the SHA-256 of a network's weights."""
     return fingerprint(value.detach().cpu().numpy() for value in network.state_dict().values())
+
+
+def load_metrics(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """Return the metrics that a training left in its directory, one dictionary per line.
+
+    Raises:
+        RapidError: there are none, or a line is damaged.
+    """
+    path = Path(directory) / METRICS_FILE
+    try:
+        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError) as error:
+        raise RapidError(f"Cannot read the metrics '{path}': {error}. Train again.") from error

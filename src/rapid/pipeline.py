@@ -1,0 +1,378 @@
+"""The steps of ``rapid run``, each reading the artefacts of the one before: the whole job on one page.
+
+Every function here works on directories, so the verbs of the command line call the same code.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rapid.attacks import get_attack
+from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict, validate
+from rapid.data.collection import Budget, collect, parse_shard
+from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
+from rapid.errors import RapidError, did_you_mean
+from rapid.evaluation.agents import open_agent
+from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
+from rapid.evaluation.recording import Recording, load_recordings, save_recordings
+from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
+from rapid.evaluation.summary import summary_text
+from rapid.files import read_json, write_text
+from rapid.networks.agent import QAgent, load_agent, save_agent
+from rapid.networks.q_network import QNetwork, build_network
+from rapid.progress import format_seconds, task
+from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
+from rapid.runs import RunDirectory, commit
+from rapid.scenarios import get_scenario
+from rapid.seeding import stream_seed
+from rapid.simulator import make_vec
+from rapid.spawns import TrainPart, spawn_seeds
+from rapid.teacher import make_teacher, models
+from rapid.training.offline import distill
+from rapid.training.online import adapt
+from rapid.training.record import load_metrics
+
+STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
+FLOORS = ("slower", "idle", "random", "rule")
+"""Scripted drivers that stand under every score."""
+TEACHER = "teacher"
+"""The configured teacher, as an agent to be measured."""
+RECORDED = 4
+"""Episodes of the adapted agent, and of the teacher, that the report can play."""
+
+
+def run(config: Config, directory: Path, restart: str = "", say: Callable[[str], None] = print) -> Path:
+    """Do every step that is not done yet and return the path of the report.
+
+    Args:
+        config: the settings.
+        directory: where the run lives; made, or gone on with.
+        restart: a step to redo, with all later ones; empty to redo none.
+        say: receives a line at a time.
+
+    Raises:
+        RapidError: anything about the input or the surroundings that keeps the run from its end.
+    """
+    check(config)
+    if restart and restart not in STEPS:
+        raise RapidError(f"Unknown step '{restart}'{did_you_mean(restart, STEPS)} Steps: {', '.join(STEPS)}.")
+    home = RunDirectory(directory, config, STEPS)
+    if restart:
+        home.restart_from(restart)
+    actions: dict[str, Callable[[Config, RunDirectory], dict[str, Any]]] = {
+        "collect": _collect,
+        "mix": _mix,
+        "distill": _distill,
+        "adapt": _adapt,
+        "evaluate": _evaluate,
+        "report": _report,
+    }
+    say(f"run {directory}: {config.scenario}, recipe {config.recipe}, scale {config.scale}, seed {config.seed}")
+    for number, step in enumerate(STEPS, 1):
+        heading = f"[{number}/{len(STEPS)}] {step}"
+        if home.is_done(step):
+            say(f"{heading}: done before, in {format_seconds(home.facts(step)['seconds'])}")
+            continue
+        say(heading)
+        start = time.monotonic()
+        facts = actions[step](config, home)
+        home.finish(step, time.monotonic() - start, **facts)
+    say("\n" + (home.path / "evaluate" / "summary.txt").read_text(encoding="utf-8"))
+    times = ", ".join(f"{step} {format_seconds(home.facts(step)['seconds'])}" for step in STEPS)
+    say(f"time: {times}")
+    say(f"report: {(home.path / 'report.html').resolve()}")
+    return home.path / "report.html"
+
+
+def check(config: Config) -> None:
+    """Look for everything that can be seen to be wrong before any work starts.
+
+    Raises:
+        RapidError: the first thing found.
+    """
+    validate(config)
+    torch.set_num_threads(config.threads)
+    try:
+        torch.empty(0, device=config.device)
+    except (RuntimeError, AssertionError) as error:
+        raise RapidError(
+            f"Device '{config.device}' cannot be used: {str(error).splitlines()[0]} Use --device cpu."
+        ) from error
+    lanes = get_scenario(config.scenario).lanes
+    for name in config.evaluate.attacks:
+        get_attack(name, lanes)
+    parse_shard(config.collect.shard)
+    if config.teacher.backend == "scripted":
+        make_teacher(config.teacher, lanes)
+    elif config.teacher.backend == "local":
+        models.is_present(config.teacher.model)
+
+
+# Phase 1
+
+
+def _collect(config: Config, home: RunDirectory) -> dict[str, Any]:
+    teacher_data = collect_transitions(config, home.path / "collect" / "teacher", "teacher")
+    random_data = collect_transitions(config, home.path / "collect" / "random", "random")
+    return {"teacher_transitions": len(teacher_data), "random_transitions": len(random_data)}
+
+
+def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher") -> Dataset:
+    """Let the configured teacher drive, or for `source` random the uniform driver, and keep every step in `out`."""
+    settings = config.teacher if source == "teacher" else TeacherConfig(backend="scripted", model="random")
+    sizes = config.collect
+    wanted = sizes.teacher_transitions if source == "teacher" else sizes.random_transitions
+    teacher = make_teacher(settings, get_scenario(config.scenario).lanes, config.seed)
+    with task(f"collect, {teacher.name}", wanted, "transitions") as work:
+        return collect(
+            teacher,
+            config.scenario,
+            out,
+            wanted,
+            sizes.lockstep if source == "teacher" else max(sizes.lockstep, 100),
+            source=source,
+            shard=sizes.shard,
+            budget=Budget(sizes.max_tokens, sizes.max_cost, sizes.max_seconds) if source == "teacher" else None,
+            progress=work,
+        )
+
+
+def _mix(config: Config, home: RunDirectory) -> dict[str, Any]:
+    collected = home.path / "collect"
+    mixed = mix_datasets(config, collected / "teacher", collected / "random", home.path / "mix")
+    return {"transitions": len(mixed), "teacher_share": mixed.teacher_share}
+
+
+def mix_datasets(config: Config, teacher_data: Path, random_data: Path, out: Path) -> Dataset:
+    """Mix two datasets at ratio p into `out`."""
+    teacher, random = load_dataset(teacher_data), load_dataset(random_data)
+    mixed = mix(teacher, random, config.mix.p, config.mix.size, stream_seed(config.seed, "mix"))
+    save_dataset(mixed, out)
+    return mixed
+
+
+# Phase 2
+
+
+def _distill(config: Config, home: RunDirectory) -> dict[str, Any]:
+    mixed = home.path / "mix"
+    distill_agent(config, mixed, home.path / "distill" / "rapid", "distilled")
+    # The two baselines that see the same data: what the method adds is the difference to them.
+    plain = replace(config.distill.loss, conservative_weight=0.0, robust_weight=0.0, double=False)
+    mlp = replace(config, network=replace(config.network, kind="mlp"))
+    dqn = replace(mlp, distill=replace(mlp.distill, loss=plain))
+    distill_agent(dqn, mixed, home.path / "distill" / "offline-dqn", "offline DQN")
+    cloning = replace(mlp.distill, optimizer=replace(mlp.distill.optimizer, algorithm="bc"))
+    distill_agent(replace(mlp, distill=cloning), mixed, home.path / "distill" / "cloning", "behaviour cloning")
+    return {}
+
+
+def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled") -> QAgent:
+    """Train a policy offline on the dataset in `data`; the agent is written to ``out/agent``."""
+    dataset = load_dataset(data)
+    network = build_network(
+        config.network, get_scenario(dataset.scenario).lanes, stream_seed(config.seed, "network")
+    ).to(config.device)
+    with task(f"distill, {name}", config.distill.iterations, "iterations") as work:
+        distill(
+            dataset.transitions,
+            network,
+            config.distill,
+            out,
+            seed=stream_seed(config.seed, "distill"),
+            evaluate=_curve(config, dataset.scenario, name),
+            progress=work,
+            teacher_share=dataset.teacher_share,
+        )
+    metadata = {"name": name, "phase": "distill", "data": str(data), "scenario": dataset.scenario, "seed": config.seed}
+    save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
+    return QAgent(network, name)
+
+
+def _curve(config: Config, scenario: str, name: str) -> Callable[[QNetwork, int], dict[str, float]] | None:
+    """What a trainer calls to put a point on the learning curve: clean return and crash share on tuning spawns."""
+    if config.evaluate.curve_spawns == 0:
+        return None
+    seeds = spawn_seeds("tune", config.evaluate.curve_spawns)
+
+    def evaluate(network: QNetwork, iteration: int) -> dict[str, float]:
+        episodes = run_episodes(QAgent(network, name), scenario, seeds, simulator=config.simulator)
+        return {"return": float(episodes.return_E.mean()), "crash_share": float(episodes.crashed_E.mean())}
+
+    return evaluate
+
+
+# Phase 3
+
+
+def _adapt(config: Config, home: RunDirectory) -> dict[str, Any]:
+    adapt_agent(config, home.path / "distill" / "rapid" / "agent", home.path / "mix", home.path / "adapt" / "rapid")
+    return {}
+
+
+def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name: str = "RAPID") -> QAgent:
+    """Let the agent in `agent` learn online in the target scenario; it is written to ``out/agent``."""
+    scenario = config.adapt.scenario or config.scenario
+    with task(f"adapt, {name}", config.adapt.steps, "steps") as work:
+        network = adapt(
+            load_agent(agent, config.device).network,
+            config.adapt,
+            scenario,
+            out,
+            seed=stream_seed(config.seed, "adapt"),
+            offline=load_dataset(data).transitions if data else None,
+            evaluate=_curve(config, scenario, name),
+            progress=work,
+            make_worlds=lambda count: make_vec(scenario, count, simulator=config.simulator),
+        )
+    metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
+    save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
+    return QAgent(network, name)
+
+
+# Measuring
+
+
+def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
+    specs = list(FLOORS)
+    if config.evaluate.teacher_spawns:
+        specs.append(TEACHER)
+    if config.simulator == "compiled":
+        specs.append("planner")
+    specs += [str(home.path / "distill" / name / "agent") for name in ("cloning", "offline-dqn", "rapid")]
+    specs.append(str(home.path / "adapt" / "rapid" / "agent"))
+    rows = _measure(config, config.adapt.scenario or config.scenario, specs, home.path / "evaluate")
+    return {"episodes": len(rows)}
+
+
+def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
+    """Drive the agents named and write rows, table and plot to `out`; `teacher` is the configured teacher."""
+    check(config)
+    for spec in specs:
+        _open(config, spec, config.scenario)
+    rows = _measure(config, config.scenario, specs, out)
+    write_figures(ReportData(title=f"{config.scenario}", rows=rows), out)
+    return rows
+
+
+def _open(config: Config, spec: str, scenario: str) -> Any:
+    if spec == TEACHER:
+        return make_teacher(config.teacher, get_scenario(scenario).lanes, config.seed)
+    return open_agent(spec, scenario, config.seed)
+
+
+def _measure(config: Config, scenario: str, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
+    """Drive every agent over the test spawns under every attack; an agent that is done is not driven again."""
+    rows: list[EpisodeRow] = []
+    for number, spec in enumerate(specs):
+        part = out / "parts" / f"{number:02}.parquet"
+        if not part.exists():
+            episodes = _drive(config, scenario, spec)
+            if recordings := [recording for of in episodes for recording in of.recordings[:RECORDED]]:
+                save_recordings(part.with_suffix(".recordings.json"), recordings)
+            source = commit()
+            save_rows(
+                part, [row for of in episodes for row in of.rows(config.seed if of.has_network else None, source)]
+            )
+        rows += load_rows(part)
+    save_rows(out / "episodes.parquet", rows)
+    write_text(out / "summary.txt", summary_text(rows) + "\n")
+    return rows
+
+
+def _drive(config: Config, scenario: str, spec: str) -> list[Episodes]:
+    agent = _open(config, spec, scenario)
+    spawns, attacks = config.evaluate.spawns, config.evaluate.attacks
+    if spec == TEACHER:
+        # A language model takes long over a decision: fewer spawns, and only as it drives undisturbed.
+        spawns, attacks = config.evaluate.teacher_spawns, ("none",)
+    attacks = [name for name in attacks if is_applicable(agent, name)]
+    with task(f"evaluate, {agent.name}", spawns * len(attacks), "episodes") as work:
+        return [
+            run_episodes(
+                agent,
+                scenario,
+                spawn_seeds("test", spawns),
+                attack,
+                generator_seed=config.seed,
+                record=attack == "none" and (spec == TEACHER or agent.name == "RAPID"),
+                simulator=config.simulator,
+                progress=work.advance,
+            )
+            for attack in attacks
+        ]
+
+
+# Showing
+
+
+def _report(config: Config, home: RunDirectory) -> dict[str, Any]:
+    write_run_report(config, home.path)
+    return {}
+
+
+def report_again(directory: Path) -> Path:
+    """Write the page of a finished run again and return its path.
+
+    Raises:
+        RapidError: there is no run, or it has not been measured yet.
+    """
+    manifest = read_json(directory / "run.json", "run manifest")
+    config = apply_overrides(preset(), manifest.get("config", {}), source=f"'{directory / 'run.json'}'")
+    return write_run_report(config, directory)
+
+
+def write_run_report(config: Config, directory: Path) -> Path:
+    """Gather the artefacts of a run into ``report.html`` and the figures beside it."""
+    manifest = read_json(directory / "run.json", "run manifest")
+    steps = {step: directory / "steps" / f"{step}.json" for step in STEPS}
+    recordings = [
+        recording
+        for path in sorted((directory / "evaluate" / "parts").glob("*.recordings.json"), reverse=True)
+        for recording in load_recordings(path)
+    ]
+    teacher_data = load_dataset(directory / "collect" / "teacher")
+    notes = []
+    if config.scale != "full":
+        notes.append(f"Scale {config.scale}: one training seed and few spawns. This shows that it works, not how well.")
+    data = ReportData(
+        title=f"RAPID on {config.adapt.scenario or config.scenario}",
+        settings=to_dict(config),
+        versions=manifest["versions"],
+        commit=manifest["commit"],
+        command=f"rapid run --config {directory / 'config.toml'}",
+        started=manifest["started"],
+        timings={step: read_json(path)["seconds"] for step, path in steps.items() if path.exists()},
+        rows=load_rows(directory / "evaluate" / "episodes.parquet"),
+        main_agent="RAPID",
+        distill={
+            "distilled": load_metrics(directory / "distill" / "rapid"),
+            "offline DQN": load_metrics(directory / "distill" / "offline-dqn"),
+            "behaviour cloning": load_metrics(directory / "distill" / "cloning"),
+        },
+        adapt={"RAPID": load_metrics(directory / "adapt" / "rapid")},
+        routing=_routing(config, directory, recordings),
+        recordings=recordings,
+        dataset={"driver": teacher_data.drivers, **summary(teacher_data)},
+        notes=notes,
+    )
+    write_figures(data, directory / "figures")
+    return write_report(data, directory / "report.html")
+
+
+def _routing(config: Config, directory: Path, recordings: Sequence[Recording]) -> list[RoutingSnapshot]:
+    """The routing weights in one scene of RAPID's first recorded episode, before and after adaptation."""
+    recording = next((recording for recording in recordings if recording.agent == "RAPID"), None)
+    if recording is None or config.network.kind != "rapid":
+        return []
+    obs_VF = recording.obs_TVF[len(recording.action_T) // 2]
+    snapshots = []
+    for label, agent in (("before adaptation", "distill"), ("after adaptation", "adapt")):
+        weights_BVN = load_agent(directory / agent / "rapid" / "agent").explain(obs_VF[None]).weights_BVN
+        if weights_BVN is not None:
+            snapshots.append(RoutingSnapshot(label, weights_BVN[0].numpy(), obs_VF))
+    return snapshots

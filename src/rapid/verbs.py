@@ -1,0 +1,371 @@
+"""What each verb of the command line does. Options are fields of the settings tree (:mod:`rapid.config`)."""
+
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+from tyro.conf import Positional, arg
+
+from rapid import config as settings
+from rapid.config import (
+    AdaptConfig,
+    CollectConfig,
+    Config,
+    DistillConfig,
+    EvaluateConfig,
+    MixConfig,
+    NetworkConfig,
+    Recipe,
+    Scale,
+    TeacherConfig,
+)
+
+T = TypeVar("T")
+
+# A section of the tree whose options stand at the top level: `--p`, not `--mix.p`.
+Flat = Annotated[T, arg(name="")]
+SettingsFile = Annotated[str, arg(name="config", metavar="FILE.toml")]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the defaults of a verb's settings come from."""
+
+    recipe: Recipe = Config.recipe
+    """Defaults of the settings."""
+    scale: Scale = Config.scale
+    """Defaults of the sizes."""
+    file: SettingsFile = ""
+    """Settings in a TOML file; options override it, it overrides recipe and scale."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Do everything, in one directory: collect, mix, distill, adapt, evaluate, report.
+
+    The same command goes on after an interruption.
+    """
+
+    settings: Flat[Config] = field(default_factory=Config)
+    file: SettingsFile = ""
+    """Settings in a TOML file; options override it, it overrides recipe and scale."""
+    directory: str = ""
+    """Where the run lives; by default runs/SCENARIO-RECIPE-SCALE-seedN."""
+    restart: Annotated[str, arg(name="from", metavar="STEP")] = ""
+    """Redo this step and all later ones: collect, mix, distill, adapt, evaluate or report."""
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Let a teacher drive and keep every step as an offline dataset.
+
+    The same command goes on after an interruption.
+    """
+
+    collect: Flat[CollectConfig] = field(default_factory=CollectConfig)
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    out: str = "data/teacher"
+    """Directory of the dataset."""
+    scenario: str = Config.scenario
+    """Where the teacher drives."""
+    seed: int = Config.seed
+    """Decides the random driver's actions; the traffic is fixed by the spawn seeds."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Mix:
+    """Mix a teacher's and a random dataset into one, transition by transition."""
+
+    teacher_data: Annotated[Positional[str], arg(metavar="TEACHER_DATA")]
+    """Directory of the teacher's dataset."""
+    random_data: Annotated[Positional[str], arg(metavar="RANDOM_DATA")]
+    """Directory of the random dataset."""
+    mix: Flat[MixConfig] = field(default_factory=MixConfig)
+    out: str = "data/mixed"
+    """Directory of the mixture."""
+    seed: int = Config.seed
+    """Decides which transitions are drawn."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Distill:
+    """Phase 2: train a policy offline on a dataset, with the robust term."""
+
+    dataset: Annotated[Positional[str], arg(metavar="DATASET")]
+    """Directory of the dataset."""
+    distill: Flat[DistillConfig] = field(default_factory=DistillConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    out: str = "distilled"
+    """Directory of the agent and its training record."""
+    curve_spawns: int = EvaluateConfig.curve_spawns
+    """Episodes of each point of the learning curve."""
+    seed: int = Config.seed
+    """Decides the weights, the batches and the inner attack."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Adapt:
+    """Phase 3: let an agent learn online in the target scenario, its distilled policy frozen."""
+
+    agent: Annotated[Positional[str], arg(metavar="AGENT")]
+    """Directory of the agent."""
+    adapt: Flat[AdaptConfig] = field(default_factory=AdaptConfig)
+    dataset: str = ""
+    """Offline dataset: for --offline-share, and to measure what is forgotten."""
+    out: str = "adapted"
+    """Directory of the adapted agent and its training record."""
+    curve_spawns: int = EvaluateConfig.curve_spawns
+    """Episodes of each point of the learning curve."""
+    seed: int = Config.seed
+    """Decides the traffic, the exploration and the batches."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare agents over the same fixed spawns, clean and under attacks, in one table and one plot."""
+
+    agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
+    """Directories of agents, ONNX files, and scripted drivers by name (slower, idle, faster, random, rule, planner)."""
+    evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
+    scenario: str = Config.scenario
+    """Where they drive."""
+    simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
+    """The compiled twin, or highway-env itself."""
+    out: str = "evaluation"
+    """Directory of the episodes, the table and the plot."""
+    seed: int = Config.seed
+    """Decides the noise of attacks and the random driver; the traffic is fixed by the spawn seeds."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write the page of a run again."""
+
+    directory: Annotated[Positional[str], arg(metavar="DIRECTORY")]
+    """Directory of the run."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """List the embedded language models, fetch one, verify it, or remove it."""
+
+    action: Annotated[Positional[str], arg(metavar="ACTION")] = "list"
+    """list, pull, verify or remove."""
+    name: Annotated[Positional[str], arg(metavar="NAME")] = ""
+    """The model; not needed to list."""
+
+
+@dataclass(frozen=True)
+class VerifySimulator:
+    """Hold the compiled simulator against the installed highway-env, step by step, and give a verdict."""
+
+    episodes: int = 12
+    """Episodes in all, shared among the scenarios."""
+    scenario: tuple[str, ...] = ()
+    """Scenarios; by default the paper's with both dynamics, and others that reach the rest of the configuration."""
+    processes: int = 1
+    """Processes that drive highway-env, which takes nearly all of the time."""
+    out: str = ""
+    """Write the findings to this JSON file."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check Python, torch, the simulator's speed, the cache, the model and the endpoint."""
+
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+
+
+def call(verb: str, words: Sequence[str]) -> int:
+    """Parse the options of `verb` and do it.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        RapidError: any input that cannot be used.
+        SystemExit: after printing the help, or tyro's own explanation of a wrong option (2).
+    """
+    kind, action = _VERBS[verb]
+    base = _base_settings(words)
+    options = tyro.cli(
+        kind,
+        args=list(words),
+        prog=f"rapid {verb}",
+        default=_defaults(kind, base),
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+    )
+    return action(options, _with_options(base, options))
+
+
+def _base_settings(words: Sequence[str]) -> Config:
+    """The settings that recipe, scale and a settings file give, before the options."""
+    chosen = {name: _option(words, name) for name in ("recipe", "scale", "config")}
+    overrides = settings.load_toml(chosen["config"]) if chosen["config"] else {}
+    source = f"'{chosen['config']}'"
+    recipe = chosen["recipe"] or overrides.get("recipe") or Config.recipe
+    scale = chosen["scale"] or overrides.get("scale") or Config.scale
+    if words and ("-h" in words or "--help" in words):
+        recipe, scale = (
+            (recipe if recipe in settings.RECIPES else "strong"),
+            (scale if scale in settings.SCALES else "quick"),
+        )
+    base = settings.preset(recipe, scale)
+    overrides = {key: value for key, value in overrides.items() if key not in ("recipe", "scale")}
+    return settings.apply_overrides(base, overrides, source=source)
+
+
+def _option(words: Sequence[str], name: str) -> str:
+    """The value of ``--name value`` or ``--name=value`` among `words`, or an empty string."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word == f"--{name}":
+            return following
+        if word.startswith(f"--{name}="):
+            return word.partition("=")[2]
+    return ""
+
+
+def _defaults(kind: type[T], base: Config) -> T:
+    """An instance of a verb's options with the values of `base`; positional fields stay required."""
+    values: dict[str, Any] = {}
+    for item in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+        if item.name == "settings":
+            values[item.name] = base
+        elif item.name == "source":
+            values[item.name] = Source(base.recipe, base.scale)
+        elif hasattr(base, item.name) and kind is not VerifySimulator:
+            values[item.name] = getattr(base, item.name)
+        elif item.name == "curve_spawns":
+            values[item.name] = base.evaluate.curve_spawns
+        elif item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:
+            values[item.name] = tyro.MISSING
+    return kind(**values)
+
+
+def _with_options(base: Config, options: Any) -> Config:
+    """`base` with the sections and values that a verb's options carry."""
+    if isinstance(options, Run):
+        return settings.validate(options.settings)
+    names = {item.name for item in dataclasses.fields(options)} & {item.name for item in dataclasses.fields(Config)}
+    config = dataclasses.replace(base, **{name: getattr(options, name) for name in names})
+    if curve_spawns := getattr(options, "curve_spawns", None):
+        config = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, curve_spawns=curve_spawns))
+    return settings.validate(config)
+
+
+def _run(options: Run, config: Config) -> int:
+    from rapid import pipeline
+
+    name = f"{config.scenario}-{config.recipe}-{config.scale}-seed{config.seed}".replace(":", "-")
+    pipeline.run(config, Path(options.directory or f"runs/{name}"), options.restart)
+    return 0
+
+
+def _collect(options: Collect, config: Config) -> int:
+    from rapid import pipeline
+
+    pipeline.check(config)
+    dataset = pipeline.collect_transitions(config, Path(options.out))
+    print(f"{len(dataset)} transitions in {options.out}")
+    return 0
+
+
+def _mix(options: Mix, config: Config) -> int:
+    from rapid import pipeline
+
+    mixed = pipeline.mix_datasets(config, Path(options.teacher_data), Path(options.random_data), Path(options.out))
+    print(f"{len(mixed)} transitions in {options.out}")
+    return 0
+
+
+def _distill(options: Distill, config: Config) -> int:
+    from rapid import pipeline
+
+    pipeline.distill_agent(config, Path(options.dataset), Path(options.out))
+    print(f"The agent is in {options.out}/agent")
+    return 0
+
+
+def _adapt(options: Adapt, config: Config) -> int:
+    from rapid import pipeline
+
+    dataset = Path(options.dataset) if options.dataset else None
+    pipeline.adapt_agent(config, Path(options.agent), dataset, Path(options.out))
+    print(f"The agent is in {options.out}/agent")
+    return 0
+
+
+def _evaluate(options: Evaluate, config: Config) -> int:
+    from rapid import pipeline
+
+    pipeline.compare(config, options.agents, Path(options.out))
+    print((Path(options.out) / "summary.txt").read_text(encoding="utf-8"))
+    return 0
+
+
+def _report(options: Report, config: Config) -> int:
+    from rapid import pipeline
+
+    print(pipeline.report_again(Path(options.directory)))
+    return 0
+
+
+def _models(options: Models, config: Config) -> int:
+    from rapid.teacher import models
+
+    return models.command(options.action, options.name)
+
+
+def _verify(options: VerifySimulator, config: Config) -> int:
+    from rapid.files import write_json
+    from rapid.progress import task
+    from rapid.simulator.verify import verify
+
+    with task("verify", options.episodes, "episodes") as work:
+        findings = verify(
+            options.scenario or None,
+            options.episodes,
+            processes=options.processes,
+            progress=lambda done, total, findings: work.advance(),
+        )
+    print(findings.verdict())
+    if options.out:
+        write_json(options.out, findings.to_dict())
+    return 0 if findings.passed else 1
+
+
+def _doctor(options: Doctor, config: Config) -> int:
+    from rapid.doctor import examine
+
+    mark = {"ok": "ok     ", "warning": "warning", "failed": "FAILED "}
+    failed = False
+    for finding in examine(options.teacher):
+        print(f"{mark[finding.verdict]}  {finding.name:<16} {finding.fact}", flush=True)
+        if finding.fix:
+            print(f"{'':26}{finding.fix}")
+        failed |= finding.verdict == "failed"
+    print("Something needs mending, see above." if failed else "Everything that a run needs is there.", file=sys.stderr)
+    return int(failed)
+
+
+_VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
+    "run": (Run, _run),
+    "collect": (Collect, _collect),
+    "mix": (Mix, _mix),
+    "distill": (Distill, _distill),
+    "adapt": (Adapt, _adapt),
+    "evaluate": (Evaluate, _evaluate),
+    "report": (Report, _report),
+    "models": (Models, _models),
+    "verify-simulator": (VerifySimulator, _verify),
+    "doctor": (Doctor, _doctor),
+}
