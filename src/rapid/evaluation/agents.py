@@ -32,22 +32,26 @@ class Driver(Protocol):
 
 
 def open_agent(spec: str, scenario: str, seed: int = 0) -> Any:
-    """Return the agent that `spec` names: a directory of a trained agent, or a scripted driver's name.
+    """Return the agent that `spec` names: a directory of a trained agent, a scripted driver's name, or `planner`.
 
     `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are.
 
     Raises:
-        RapidError: `spec` is neither.
+        RapidError: `spec` is none of them.
     """
     from rapid.teacher.scripted import SCRIPTED, Scripted
 
     if spec in SCRIPTED:
         return Scripted(spec, get_scenario(scenario).lanes, seed)
+    if spec == "planner":
+        from rapid.simulator.search import PlannerAgent
+
+        return PlannerAgent()
     if Path(spec).is_dir():
         return rapid.load_agent(spec)
     raise RapidError(
-        f"There is no agent '{spec}'{did_you_mean(spec, SCRIPTED)} Give the directory of an agent that `rapid distill` "
-        f"or `rapid adapt` wrote, or a scripted driver: {', '.join(SCRIPTED)}."
+        f"There is no agent '{spec}'{did_you_mean(spec, (*SCRIPTED, 'planner'))} Give the directory of an agent that "
+        f"`rapid distill` or `rapid adapt` wrote, a scripted driver ({', '.join(SCRIPTED)}), or 'planner'."
     )
 
 
