@@ -1,0 +1,177 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_distill import DATA, LOSS, Killed, lines, network, weights
+
+from fake_worlds import FakeWorlds, fake_transitions
+from rapid.config import AdaptConfig, OptimizerConfig
+from rapid.data.transitions import RANDOM
+from rapid.errors import RapidError
+from rapid.training import adapt, online
+from rapid.training.learner import Learner
+from rapid.training.online import exploration
+from rapid.training.worlds import epsilon_greedy
+
+SCENARIO = "lane-3-density-2"
+CONFIG = AdaptConfig(
+    steps=60,
+    num_envs=3,
+    updates_per_step=0.5,
+    buffer_size=60,
+    learning_starts=20,
+    evaluate_every=30,
+    loss=replace(LOSS, conservative_weight=0.0, robust_weight=0.0, n_step=2),
+    optimizer=OptimizerConfig(batch_size=8),
+)
+MIXED = replace(CONFIG, offline_share=0.5, loss=replace(CONFIG.loss, robust_weight=0.5, robust_labels="soft"))
+
+
+def worlds(count: int) -> FakeWorlds:
+    return FakeWorlds(count, autoreset=True)
+
+
+@pytest.fixture(autouse=True)
+def _often(monkeypatch):
+    monkeypatch.setattr(online, "LOG_EVERY", 15)
+    torch.set_num_threads(1)
+
+
+def train(directory, config=CONFIG, kind="rapid", offline=DATA, seed=3, net=None, **options):
+    net = network(kind) if net is None else net
+    return adapt(net, config, SCENARIO, directory, seed, offline, make_worlds=worlds, **options)
+
+
+@pytest.mark.parametrize("config", [CONFIG, MIXED], ids=["online", "mixed"])
+def test_training_twice_is_bit_equal(tmp_path, config):
+    first, second = (train(tmp_path / f"{i}", config) for i in (1, 2))
+    assert weights(first) == weights(second) != weights(network())
+    assert lines(tmp_path / "1") == lines(tmp_path / "2")
+    assert weights(train(tmp_path / "3", config, seed=4)) != weights(first)
+
+
+@pytest.mark.parametrize(
+    ("config", "stop"), [(CONFIG, 1), (CONFIG, 9), (CONFIG, 20), (MIXED, 12)], ids=["first", "early", "last", "mixed"]
+)
+def test_resumed_equals_uninterrupted(tmp_path, monkeypatch, stop, config):
+    whole = train(tmp_path / "whole", config)
+    update = Learner.update
+
+    def dying(self, batch):
+        if self.updates == stop - 1:
+            raise Killed
+        update(self, batch)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Learner, "update", dying)
+        with pytest.raises(Killed):
+            train(tmp_path / "cut", config, checkpoint_seconds=0)
+    resumed = train(tmp_path / "cut", config)
+    assert weights(resumed) == weights(whole)
+    assert lines(tmp_path / "cut") == lines(tmp_path / "whole")
+
+
+def test_resuming_in_the_compiled_simulator_is_bit_equal(tmp_path, monkeypatch):
+    def drive(directory):
+        return adapt(network(), CONFIG, SCENARIO, directory, 3, DATA, checkpoint_seconds=0)
+
+    whole = drive(tmp_path / "whole")
+    update = Learner.update
+
+    def dying(self, batch):
+        if self.updates == 12:
+            raise Killed
+        update(self, batch)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Learner, "update", dying)
+        with pytest.raises(Killed):
+            drive(tmp_path / "cut")
+    assert weights(drive(tmp_path / "cut")) == weights(whole)
+    assert lines(tmp_path / "cut") == lines(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("kind", ["rapid", "mlp-mixture"])
+@pytest.mark.parametrize("freeze_decoder", [False, True])
+def test_the_distilled_policy_stays_bit_equal(tmp_path, kind, freeze_decoder):
+    if kind == "mlp-mixture" and freeze_decoder:
+        pytest.skip("a mixture of actions has no decoder")
+    trained, fresh = train(tmp_path, replace(CONFIG, freeze_decoder=freeze_decoder), kind), network(kind)
+    same = {name for name, value in trained.state_dict().items() if torch.equal(value, fresh.state_dict()[name])}
+    first = {name for name in fresh.state_dict() if "policies.0" in name or "mlps.0" in name}
+    assert first
+    assert first <= same
+    assert any("gate" in name or "weights_N" in name for name in set(fresh.state_dict()) - same)
+    assert freeze_decoder == ({name for name in fresh.state_dict() if "decoder" in name} <= same and kind == "rapid")
+
+
+def test_all_and_scratch_train_every_weight(tmp_path):
+    fresh = network("mlp")
+    for mode in ("all", "scratch"):
+        trained = train(tmp_path / mode, replace(CONFIG, train=mode), "mlp")
+        changed = [
+            not torch.equal(value, old) for value, old in zip(trained.parameters(), fresh.parameters(), strict=True)
+        ]
+        assert all(changed)
+    with pytest.raises(RapidError, match="no adapter to train"):
+        train(tmp_path / "adapter", kind="mlp")
+
+
+def test_metrics_say_how_much_was_forgotten_and_how_far_the_gate_opened(tmp_path):
+    seen = []
+    train(tmp_path, evaluate=lambda net, steps: {"at": seen.append(steps) or steps})
+    rows = {row["step"]: row for row in lines(tmp_path)}
+    assert sorted(rows) == [15, 30, 45, 60]
+    assert seen == [30, 60]
+    assert rows[60]["evaluation"] == {"at": 60}
+    assert rows[15]["gate"] == 0
+    assert rows[60]["gate"] > 0
+    assert all(0 <= rows[step]["agreement"] <= 1 for step in seen)
+    assert rows[60]["updates"] == 20
+    assert rows[60]["learning_rate"] == 0
+    assert rows[45]["episodes"] >= 1
+    # Nothing is forgotten where nothing can change.
+    still = replace(CONFIG, learning_starts=1_000)
+    train(tmp_path / "still", still)
+    assert lines(tmp_path / "still")[-1]["agreement"] == 1
+    assert "agreement" not in lines(tmp_path / "still")[0]
+    train(tmp_path / "none", offline=None)
+    assert lines(tmp_path / "none")[-1]["agreement"] is None
+
+
+def test_exploration_falls_from_end_to_end():
+    config = AdaptConfig(steps=1_000, exploration_start=0.9, exploration_end=0.1, exploration_share=0.5)
+    assert exploration(config, 0) == 0.9
+    assert exploration(config, 250) == pytest.approx(0.5)
+    assert exploration(config, 500) == exploration(config, 1_000) == pytest.approx(0.1)
+    values = [exploration(config, step) for step in range(0, 1_001, 10)]
+    assert values == sorted(values, reverse=True)
+    assert exploration(replace(config, exploration_share=0.0), 0) == pytest.approx(0.1)
+
+
+def test_epsilon_is_the_share_of_random_actions():
+    net = network("mlp")
+    obs = fake_transitions(200).obs_NVF
+    greedy = epsilon_greedy(net, obs, 0.0, np.random.default_rng(0), "cpu")
+    np.testing.assert_array_equal(greedy, net(torch.from_numpy(obs)).argmax(1))
+    rng = np.random.default_rng(0)
+    other = epsilon_greedy(net, obs, 1.0, rng, "cpu")
+    assert np.bincount(other, minlength=5).min() > 300
+    some = epsilon_greedy(net, obs, 0.25, rng, "cpu")
+    assert (some != greedy).mean() == pytest.approx(0.25 * 0.8, abs=0.04)
+
+
+def test_settings_that_do_not_fit_are_refused(tmp_path):
+    robust = replace(CONFIG, loss=replace(CONFIG.loss, robust_weight=0.5))
+    for config, offline, message in (
+        (replace(CONFIG, offline_share=0.5), None, "needs the offline data"),
+        (robust, DATA, "no teacher transitions are in the batches"),
+        (replace(robust, offline_share=0.5), fake_transitions(5, RANDOM), "needs transitions of the teacher"),
+        (replace(CONFIG, optimizer=OptimizerConfig(algorithm="bc")), DATA, "Cloning has nothing to learn"),
+    ):
+        with pytest.raises(RapidError, match=message):
+            train(tmp_path, config, offline=offline)
+    train(tmp_path)
+    with pytest.raises(RapidError, match=r"other settings \(weights differ\)"):
+        train(tmp_path, net=network(seed=9))
