@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rapid.config import RobustConfig
 
@@ -50,11 +51,22 @@ def maximize_loss(
             offset_BVF = torch.zeros_like(obs_BVF)
         for _ in range(config.steps):
             attacked_BVF = (obs_BVF + offset_BVF * scale_F).requires_grad_()
-            log_probs_BA = (network(attacked_BVF) / temperature).log_softmax(-1)
-            (gradient_BVF,) = torch.autograd.grad(-(labels_BA * log_probs_BA).sum(), attacked_BVF)
+            loss = _cross_entropy(network(attacked_BVF) / temperature, labels_BA)
+            (gradient_BVF,) = torch.autograd.grad(loss, attacked_BVF)
             step_BVF = _direction(gradient_BVF * (scale_F * free_F), config.norm) * config.step_size
             offset_BVF = _project(offset_BVF + step_BVF, config)
         return obs_BVF + offset_BVF * scale_F
+
+
+def _cross_entropy(logits_BA: Tensor, labels_BA: Tensor) -> Tensor:
+    """Return -sum label log softmax, with a gradient that stays exact however sure the network is.
+
+    The usual form has the gradient p - 1 by the label's logit, which float32 rounds to 0 once p is near 1. This one is
+    -log p_a = softplus(logsumexp over the others of z_j - z_a), where nothing cancels.
+    """
+    others_AA = torch.eye(logits_BA.shape[-1], device=logits_BA.device) * -1e30
+    margins_BAA = logits_BA[:, None, :] - logits_BA[:, :, None] + others_AA
+    return (labels_BA * functional.softplus(margins_BAA.logsumexp(-1))).sum()
 
 
 def _direction(gradient_BVF: Tensor, norm: str) -> Tensor:

@@ -153,7 +153,12 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
                 "It cannot drive here."
             )
     lanes, metadata = config.get("lanes"), config.get("metadata")
-    if not isinstance(lanes, int) or not isinstance(config.get("network"), dict) or not isinstance(metadata, dict):
+    if (
+        type(lanes) is not int
+        or lanes < 1
+        or not isinstance(config.get("network"), dict)
+        or not isinstance(metadata, dict)
+    ):
         raise RapidError(
             f"The agent '{folder}' is damaged: {CONFIG_FILE} lacks network, lanes or metadata. Save it again."
         )
