@@ -202,3 +202,11 @@ def test_kinds_follow_from_what_an_agent_offers(constant) -> None:
     assert kind_of(SimpleNamespace(bind=print)) == "planner"
     assert kind_of(constant(IDLE)) == "learned"
     assert kind_of(SimpleNamespace(act=print, kind="planner")) == "planner"
+
+
+def test_agents_open_by_name_or_file(tmp_path: Path) -> None:
+    assert kind_of(open_agent("planner", SCENARIO)) == "planner"
+    with pytest.raises(RapidError):
+        open_agent(str(tmp_path / "absent.onnx"), SCENARIO)
+    with pytest.raises(RapidError, match=r"There is no agent 'rapd'.*an ONNX file"):
+        open_agent("rapd", SCENARIO)

@@ -32,7 +32,7 @@ class Driver(Protocol):
 
 
 def open_agent(spec: str, scenario: str, seed: int = 0) -> Any:
-    """Return the agent that `spec` names: a directory of a trained agent, a scripted driver's name, or `planner`.
+    """Return the agent that `spec` names: a saved agent's directory, an ONNX file, or a driver's name.
 
     `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are.
 
@@ -49,9 +49,14 @@ def open_agent(spec: str, scenario: str, seed: int = 0) -> Any:
         return PlannerAgent()
     if Path(spec).is_dir():
         return rapid.load_agent(spec)
+    if Path(spec).suffix == ".onnx":
+        from rapid.export import OnnxAgent
+
+        return OnnxAgent(spec)
     raise RapidError(
         f"There is no agent '{spec}'{did_you_mean(spec, (*SCRIPTED, 'planner'))} Give the directory of an agent that "
-        f"`rapid distill` or `rapid adapt` wrote, a scripted driver ({', '.join(SCRIPTED)}), or 'planner'."
+        f"`rapid distill` or `rapid adapt` wrote, an ONNX file, a scripted driver "
+        f"({', '.join(SCRIPTED)}), or 'planner'."
     )
 
 

@@ -83,9 +83,14 @@ class Episodes:
 
 
 def is_applicable(agent: Any, attack: AttackLike | str | None) -> bool:
-    """Whether the attack can be made on the agent: a gradient attack needs the agent's network."""
+    """Whether the attack can be made on the agent.
+
+    A gradient attack needs the agent's network; and an agent that reads the worlds themselves sees no observation.
+    """
     resolved = _resolve(attack, lanes=1)[1]
-    return resolved is None or not resolved.needs_gradient or _network(agent) is not None
+    if resolved is None:
+        return True
+    return not callable(getattr(agent, "bind", None)) and (not resolved.needs_gradient or _network(agent) is not None)
 
 
 def run_episodes(
@@ -106,17 +111,17 @@ def run_episodes(
     episodes beside it; only a gradient attack with a random start draws for all worlds of a step together.
 
     Raises:
-        RapidError: no seeds, or a gradient attack on an agent without a network.
+        RapidError: no seeds, or an attack that cannot be made on the agent; see :func:`is_applicable`.
     """
     if len(seeds) == 0:
         raise RapidError("There are no spawn seeds to drive. Ask for at least one episode.")
     lanes = get_scenario(scenario).lanes
     attack_name, resolved = _resolve(attack, lanes)
     network = _network(agent)
-    if resolved is not None and resolved.needs_gradient and network is None:
+    if not is_applicable(agent, resolved):
         raise RapidError(
-            f"The attack '{attack_name}' needs the gradient of a network, and '{_name(agent)}' has none. Leave the "
-            "attack out for this agent: the cell is not applicable."
+            f"The attack '{attack_name}' cannot be made on '{_name(agent)}': a gradient attack needs a network, and an "
+            "agent that reads the worlds themselves sees no observation. Leave this cell out: it is not applicable."
         )
     parts: list[Worlds] = []
     for first in range(0, len(seeds), MAX_WORLDS):

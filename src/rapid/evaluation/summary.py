@@ -17,6 +17,7 @@ KINDS: dict[Kind, str] = {
 """Kinds of agents in the order of the table. All but `learned` are there for reference."""
 
 NOT_APPLICABLE = "n/a"
+NOT_APPLICABLE_WHY = "a gradient attack needs a network; and the planner reads the world, not an observation."
 NOT_RUN = "–"
 
 _SHOWN = {
@@ -129,8 +130,10 @@ def _cell(by_attack: dict[str, list[EpisodeRow]], name: str, needs_gradient: boo
     rows = by_attack.get(name, [])
     if rows:
         return AttackCell(_estimate(rows, "episode_return", resamples), _estimate(rows, "crashed", resamples))
-    has_network = any(row.has_network for of in by_attack.values() for row in of)
-    return AttackCell(None, None, NOT_APPLICABLE if needs_gradient and not has_network else NOT_RUN)
+    others = [row for of in by_attack.values() for row in of]
+    without = needs_gradient and not any(row.has_network for row in others)
+    blind = any(row.kind == "planner" for row in others)
+    return AttackCell(None, None, NOT_APPLICABLE if without or blind else NOT_RUN)
 
 
 def number(value: float, digits: int = 1, scale: float = 1.0) -> str:
@@ -184,7 +187,7 @@ def summary_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
             lines += [[row.label, number(row.metrics["episode_return"].value), *_attack_texts(row)] for row in here]
             blocks.append(_table(lines))
     if any(cell.missing == NOT_APPLICABLE for row in summaries for cell in row.attacks.values()):
-        blocks.append(f"{NOT_APPLICABLE}: a gradient attack needs a network, and this agent has none.")
+        blocks.append(f"{NOT_APPLICABLE}: {NOT_APPLICABLE_WHY}")
     blocks.append(units(summaries))
     return "\n\n".join(blocks)
 
