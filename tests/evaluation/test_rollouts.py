@@ -101,7 +101,10 @@ def test_gradient_attack_needs_a_network(toy, constant) -> None:
     assert not is_applicable(constant(IDLE), attack)
     assert is_applicable(Watcher(), attack)
     assert is_applicable(constant(IDLE), "none")
-    with pytest.raises(RapidError, match=r"needs the gradient of a network.*not applicable"):
+    planner = SimpleNamespace(bind=lambda env: constant(IDLE))
+    assert is_applicable(planner, "none")
+    assert not is_applicable(planner, Noise())
+    with pytest.raises(RapidError, match=r"a gradient attack needs a network.*not applicable"):
         run_episodes(constant(IDLE), SCENARIO, [10], attack)
     assert run_episodes(Watcher(), SCENARIO, [10], attack).gradient_attack
 

@@ -35,6 +35,7 @@ def test_order_kinds_and_labels() -> None:
 def test_cells_say_why_they_are_empty() -> None:
     table = {row.agent: row for row in summarize(ROWS, resamples=100)}
     assert table["slower"].attacks["pgd"].missing == "n/a"
+    assert table["planner"].attacks["uniform"].missing == "n/a"
     assert table["rapid"].attacks["uniform"].missing == "–"
     pgd = table["rapid"].attacks["pgd"]
     assert pgd.crashed is not None

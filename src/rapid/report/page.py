@@ -13,6 +13,7 @@ from rapid.report import sections
 from rapid.report.curves import charts, moving_picture
 from rapid.report.data import ReportData
 from rapid.report.markup import Markup, join, script_json, tag, text
+from rapid.report.routing import routing
 from rapid.report.tables import ACTION_WORDS
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
@@ -56,7 +57,7 @@ def page(run: ReportData) -> str:
                 "those of the tables.",
                 "No training was recorded.",
             ),
-            sections.routing(run.routing, lanes),
+            routing(run.routing, lanes),
             sections.dataset(run.dataset),
             sections.made_by(run),
             tag("details", tag("summary", "The summary as plain text"), tag("pre", summary_text(run.rows))),

@@ -190,7 +190,7 @@ def _paper_cell(paper: PaperResult | None) -> Markup:
 
 def _attack_cell(cell: AttackCell, paper: PaperResult | None, top: float) -> Markup:
     if cell.episode_return is None or cell.crashed is None:
-        words = "no gradient to attack" if cell.missing == NOT_APPLICABLE else "not measured"
+        words = "not applicable" if cell.missing == NOT_APPLICABLE else "not measured"
         return tag("td", tag("span", cell.missing, class_="value none"), title=words)
     of = cell.episode_return
     inside = [tag("span", number(of.value), class_="value")]
