@@ -51,7 +51,7 @@ def drive(driver: str, scenario: str, seeds: list[int], commit: str, title: str)
 
 
 def first_unavoidable(scenario: str, seeds: list[int]) -> list[int | None]:
-    """Return for each spawn the fewest decisions within which the ego crashes whatever it does; None beyond the last."""
+    """Return for each spawn the fewest decisions within which every plan crashes; None if more than are searched."""
     env = make_vec(scenario, len(seeds), autoreset=False)
     env.reset(seed=seeds)
     found: list[int | None] = [None] * len(seeds)
@@ -65,7 +65,9 @@ def first_unavoidable(scenario: str, seeds: list[int]) -> list[int | None]:
 
 
 def shown(number: Estimate, digits: int) -> str:
-    """Return an estimate and its interval as text."""
+    """Return an estimate and its interval as text; a dash for what is not measured yet."""
+    if number.episodes == 0:
+        return "–"
     return f"{number.value:.{digits}f} [{number.low:.{digits}f}, {number.high:.{digits}f}]"
 
 
@@ -95,9 +97,11 @@ def report(cells: dict[tuple[str, str, str], list[EpisodeRow]], doomed: dict[str
         lines += ["", f"## Return (crash share), `{reward}` reward", ""]
         lines += ["| driver | " + " | ".join(PAPER_SCENARIOS) + " |", "|---" * 4 + "|"]
         for driver in DRIVERS:
-            shares = [cells[reward, scenario, driver] for scenario in PAPER_SCENARIOS]
-            texts = [f"{shown(estimated(rows, 'episode_return'), 2)} ({column(rows, 'crashed').mean():.3f})"
-                     for rows in shares]  # fmt: skip
+            texts: list[str] = []
+            for scenario in PAPER_SCENARIOS:
+                rows = cells.get((reward, scenario, driver), [])
+                crashes = f" ({column(rows, 'crashed').mean():.3f})" if rows else ""
+                texts.append(shown(estimated(rows, "episode_return"), 2) + crashes)
             lines.append(f"| {driver} | " + " | ".join(texts) + " |")
     lines += ["", "## Crashes that nobody can avoid", ""]
     lines += ["Share of the spawns at which every sequence of actions crashes within so many decisions.", ""]
@@ -114,7 +118,9 @@ def report(cells: dict[tuple[str, str, str], list[EpisodeRow]], doomed: dict[str
             head += [action.lower() for action in ACTIONS] + ["ms per decision"]
             lines += ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
             for driver in DRIVERS:
-                rows = cells[reward, scenario, driver]
+                rows = cells.get((reward, scenario, driver), [])
+                if not rows:
+                    continue
                 texts = [shown(estimated(rows, "episode_return"), 2), shown(estimated(rows, "crashed"), 3)]
                 texts += [shown(estimated(rows, "mean_speed"), 1), shown(estimated(rows, "distance"), 0)]
                 texts += [f"{column(rows, name).mean():.1f}" for name in ("lane_changes", "length")]
@@ -141,17 +147,19 @@ def main() -> None:
             write_json(path, first_unavoidable(scenario, seeds))
         doomed[scenario] = read_json(path)
     cells: dict[tuple[str, str, str], list[EpisodeRow]] = {}
+    spawned = dict(zip(map(str, seeds), zip(*doomed.values(), strict=True), strict=True))
+    write_json(chosen.out / "floors-unavoidable.json", {"scenarios": list(doomed), "depth_by_seed": spawned})
     todo = [(driver, reward, scenario) for driver in DRIVERS for reward in REWARDS for scenario in PAPER_SCENARIOS]
     for number, (driver, reward, scenario) in enumerate(todo, 1):
         path = work / f"{scenario}-{reward}-{driver}.parquet"
-        if not path.exists():
+        fresh = not path.exists()
+        if fresh:
             title = f"cell {number}/{len(todo)}: {driver}, {scenario}, {reward}"
             save_rows(path, drive(driver, scenario + REWARDS[reward], seeds, commit, title))
         cells[reward, scenario, driver] = load_rows(path)
-    save_rows(chosen.out / "floors.parquet", [row for rows in cells.values() for row in rows])
-    spawned = dict(zip(map(str, seeds), zip(*doomed.values(), strict=True), strict=True))
-    write_json(chosen.out / "floors-unavoidable.json", {"scenarios": list(doomed), "depth_by_seed": spawned})
-    write_text(chosen.out / "floors.md", report(cells, doomed))
+        if fresh or number == len(todo):  # what is there can be read while the rest is measured
+            save_rows(chosen.out / "floors.parquet", [row for rows in cells.values() for row in rows])
+            write_text(chosen.out / "floors.md", report(cells, doomed))
     print(f"Wrote {os.fspath(chosen.out / 'floors.md')}")
 
 

@@ -38,7 +38,7 @@ from rapid.simulator.step import FREEZE, allocate_outputs, step_world, step_worl
 WIDTH = 48
 """Worlds that the beam keeps per decision."""
 MAX_DEPTH = 60
-"""Decisions that the planner looks ahead at most; of a plan that ends before its episode, half is followed."""
+"""Decisions that the planner looks ahead at most; of a plan that does not reach the episode's end, half is followed."""
 
 _TRY = (IDLE, SLOWER, LANE_LEFT, LANE_RIGHT, FASTER)
 """The order in which actions are tried. Of several that command the same the first stands for all, so IDLE is first."""
@@ -342,8 +342,8 @@ class BoundPlanner:
             found = plan(self._env, needed.tolist(), self._agent.width, self._agent.depth, self._agent.progress)
             for row, i in enumerate(needed):
                 length = int(found.lengths[row])
-                # The end of a plan that stops short of the episode's end heads for a future it has not seen.
-                whole = self._agent.depth is None and length < MAX_DEPTH
+                # Where the look-ahead was too short for the episode, the plan's last actions head for the unseen.
+                whole = length < found.actions.shape[1]
                 self._plans[i] = found.actions[row, : length if whole else max(length // 2, 1)]
         actions = np.full(len(ended), (_index(settings, IDLE) or [0])[0], np.int64)
         for i in np.flatnonzero(~ended):
