@@ -139,14 +139,10 @@ def look_ahead(cars, tags, settings):
             tags[AHEAD_LEFT, i] = nearest[lane - 1] if lane > 0 else -1
             tags[AHEAD_RIGHT, i] = nearest[lane + 1] if lane + 1 < settings.lanes else -1
         # A vehicle is seen from its own lane and, between two lanes, from the other one as well.
-        if -VEHICLE_LENGTH <= x < ROAD_LENGTH + VEHICLE_LENGTH:
-            y = cars[Y, i]
-            if abs(y - LANE_WIDTH * lane) <= REACH:
-                nearest[lane] = i
-            if lane > 0 and abs(y - LANE_WIDTH * (lane - 1)) <= REACH:
-                nearest[lane - 1] = i
-            if lane + 1 < settings.lanes and abs(y - LANE_WIDTH * (lane + 1)) <= REACH:
-                nearest[lane + 1] = i
+        for side in range(max(lane - 1, 0), min(lane + 2, settings.lanes)):
+            # Of several level ones the last listed counts, and the pass meets that one first.
+            if on_lane(cars, i, side) and (nearest[side] < 0 or cars[X, nearest[side]] != x):
+                nearest[side] = i
 
 
 @kernel
