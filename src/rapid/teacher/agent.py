@@ -55,7 +55,7 @@ class ScoringTeacher:
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
         if not all_facts:
             return []
-        prompts = [digest(facts, last) for facts, last in zip(all_facts, previous, strict=True)]
+        prompts = [digest(facts) for facts in all_facts]
         scores_BA, tokens = self._model.score(
             prompts[0].system, [prompt.user for prompt in prompts], ANSWER_START, _VOCABULARY
         )
@@ -82,10 +82,12 @@ class ScoringTeacher:
         return decisions
 
     def _leaning(self) -> NDArray[np.float64]:
-        if self._leaning_A is None:
-            neutral = content_free(self._lanes)
-            self._leaning_A = self._model.score(neutral.system, [neutral.user], ANSWER_START, _VOCABULARY)[0][0]
-        return self._leaning_A
+        if self._leaning_A is not None:
+            return self._leaning_A
+        neutral = content_free(self._lanes)
+        leaning_A = self._model.score(neutral.system, [neutral.user], ANSWER_START, _VOCABULARY)[0][0]
+        self._leaning_A = leaning_A
+        return leaning_A
 
 
 def softmax_over(scores_A: NDArray[np.float64], available: Sequence[int]) -> NDArray[np.float64]:

@@ -41,6 +41,15 @@ class Facts:
         future = self.forecasts[action]
         return future.brake_gap >= TIGHT_GAP and future.hold_crash == float("inf")
 
+    def avoidable(self, action: int) -> bool:
+        """Whether the forecast sees no crash if the ego brakes after the action."""
+        return self.forecasts[action].brake_gap > 0
+
+    def room(self, action: int) -> tuple[float, float, float, bool]:
+        """Return how much room the forecast leaves, to compare actions: seconds to a crash, then gaps, then braking."""
+        future = self.forecasts[action]
+        return future.brake_crash, future.brake_gap, future.hold_gap, action == SLOWER
+
 
 def gather(scene: Scene) -> Facts:
     """Compute the facts of a scene."""
@@ -80,9 +89,4 @@ def check(scene: Scene, action: int) -> Check:
 
 def safest(facts: Facts) -> int:
     """Return the available action whose forecast leaves the most room; the rule's answer when a model gives none."""
-
-    def room(action: int) -> tuple[float, float, float, bool]:
-        future = facts.forecasts[action]
-        return (min(future.hold_crash, future.brake_crash), future.brake_gap, future.hold_gap, action == SLOWER)
-
-    return max(facts.available, key=room)
+    return max(facts.available, key=facts.room)
