@@ -36,7 +36,7 @@ class TeacherConfig:
     recorded answers, `scripted` needs no model."""
     model: str = "smollm2-135m"
     """Name of the model (`rapid models list`), of the server's model, or of the scripted driver
-    (random, idle, slower, faster, rule)."""
+    (random, idle, slower, faster, rule, rule-forecast, uniform-safe)."""
     style: Literal["digest", "react"] = "digest"
     """`digest` inlines every tool result and asks for one decision; `react` lets the model call the tools in turns."""
     base_url: str = "http://127.0.0.1:8000/v1"
@@ -51,6 +51,12 @@ class TeacherConfig:
     """Seconds to wait for one answer (`endpoint`)."""
     max_retries: int = 4
     """Tries after the first for a failed request, with backoff (`endpoint`)."""
+    tool_calling: Literal["auto", "native", "text"] = "auto"
+    """How tools are called (`react`, `endpoint`): the server's own way, plain text, or the former until it refuses."""
+    max_answer_tokens: int = 400
+    """Tokens that one answer may have."""
+    shuffle_facts: bool = False
+    """Control: tell the facts of one action about another (`local`, `digest`), to see whether the model uses them."""
     max_turns: int = 8
     """Tool calls allowed before a decision must be made (`react`)."""
     price_in: float = 0.0
@@ -106,7 +112,7 @@ class NetworkConfig:
     """K: policies that are active for a vehicle; policy 1 always is, the others compete for K-1 places."""
     width: int = 64
     """D: width of a token."""
-    heads: int = 4
+    heads: int = 2
     """Attention heads."""
     layers: int = 2
     """L: transformer layers of a policy."""
@@ -252,6 +258,8 @@ class EvaluateConfig:
     """Episodes, one for each of the first spawn seeds of the set `test`."""
     teacher_spawns: int = 16
     """Episodes of the teacher, which is slow; the first of the same seeds. 0 leaves the row out."""
+    planner_spawns: int = 200
+    """Episodes of the planner, which takes seconds for each; the first of the same seeds. 0 leaves the row out."""
     curve_spawns: int = 20
     """Episodes of each point of a learning curve, from the set `tune`."""
     attacks: tuple[str, ...] = ("none", "uniform", "gaussian", "fgsm", "pgd")
@@ -350,6 +358,7 @@ def _resize(config: Config) -> Config:
             config.evaluate,
             spawns=4 if tiny else 100,
             teacher_spawns=2 if tiny else 16,
+            planner_spawns=2 if tiny else 20,
             curve_spawns=2 if tiny else 20,
         ),
     )

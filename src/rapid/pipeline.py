@@ -41,6 +41,8 @@ FLOORS = ("slower", "idle", "random", "rule")
 """Scripted drivers that stand under every score."""
 TEACHER = "teacher"
 """The configured teacher, as an agent to be measured."""
+PLANNER = "planner"
+"""Search with the simulator itself as its model: a reference, no bound."""
 RECORDED = 4
 """Episodes of the adapted agent, and of the teacher, that the report can play."""
 
@@ -150,7 +152,7 @@ def _mix(config: Config, home: RunDirectory) -> dict[str, Any]:
 def mix_datasets(config: Config, teacher_data: Path, random_data: Path, out: Path) -> Dataset:
     """Mix two datasets at ratio p into `out`."""
     teacher, random = load_dataset(teacher_data), load_dataset(random_data)
-    mixed = mix(teacher, random, config.mix.p, config.mix.size, stream_seed(config.seed, "mix"))
+    mixed = mix(teacher, random, config.mix.p, config.mix.size, stream_seed(config.seed, "mix"), config.mix.level)
     save_dataset(mixed, out)
     return mixed
 
@@ -241,8 +243,8 @@ def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
     specs = list(FLOORS)
     if config.evaluate.teacher_spawns:
         specs.append(TEACHER)
-    if config.simulator == "compiled":
-        specs.append("planner")
+    if config.evaluate.planner_spawns and config.simulator == "compiled":
+        specs.append(PLANNER)
     specs += [str(home.path / "distill" / name / "agent") for name in ("cloning", "offline-dqn", "rapid")]
     specs.append(str(home.path / "adapt" / "rapid" / "agent"))
     rows = _measure(config, config.adapt.scenario or config.scenario, specs, home.path / "evaluate")
@@ -290,6 +292,8 @@ def _drive(config: Config, scenario: str, spec: str) -> list[Episodes]:
     if spec == TEACHER:
         # A language model takes long over a decision: fewer spawns, and only as it drives undisturbed.
         spawns, attacks = config.evaluate.teacher_spawns, ("none",)
+    elif spec == PLANNER:
+        spawns = config.evaluate.planner_spawns
     attacks = [name for name in attacks if is_applicable(agent, name)]
     with task(f"evaluate, {agent.name}", spawns * len(attacks), "episodes") as work:
         return [

@@ -121,6 +121,13 @@ def vehicle_ahead(cars, tags, i, lane):
 
 
 @kernel
+def _see(cars, i, lane, nearest):
+    """Note vehicle `i` as the nearest on `lane` so far, coming from the front; of level ones the last listed counts."""
+    if on_lane(cars, i, lane) and (nearest[lane] < 0 or cars[X, nearest[lane]] != cars[X, i]):
+        nearest[lane] = i
+
+
+@kernel
 def look_ahead(cars, tags, settings):
     """Find for every vehicle the one next ahead on its lane and on the lanes beside it, in one pass from the front."""
     order, lanes = tags[ORDER], tags[LANE]
@@ -139,10 +146,12 @@ def look_ahead(cars, tags, settings):
             tags[AHEAD_LEFT, i] = nearest[lane - 1] if lane > 0 else -1
             tags[AHEAD_RIGHT, i] = nearest[lane + 1] if lane + 1 < settings.lanes else -1
         # A vehicle is seen from its own lane and, between two lanes, from the other one as well.
-        for side in range(max(lane - 1, 0), min(lane + 2, settings.lanes)):
-            # Of several level ones the last listed counts, and the pass meets that one first.
-            if on_lane(cars, i, side) and (nearest[side] < 0 or cars[X, nearest[side]] != x):
-                nearest[side] = i
+        y = cars[Y, i] - LANE_WIDTH * lane
+        _see(cars, i, lane, nearest)
+        if y <= REACH - LANE_WIDTH and lane > 0:
+            _see(cars, i, lane - 1, nearest)
+        elif y >= LANE_WIDTH - REACH and lane + 1 < settings.lanes:
+            _see(cars, i, lane + 1, nearest)
 
 
 @kernel

@@ -1,5 +1,6 @@
 """The decision loop: scene, facts, prompt, model, decision."""
 
+import dataclasses
 import json
 import time
 from collections.abc import Sequence
@@ -9,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
+from rapid.errors import RapidError
 from rapid.scenarios import NUM_ACTIONS
+from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision, Teacher
-from rapid.teacher.facts import gather
+from rapid.teacher.facts import Facts, gather
 from rapid.teacher.prompt import ANSWER_START, WORDS, content_free, digest, outcome, prompt_version
 from rapid.teacher.scene import read_scenes
 
@@ -32,17 +35,20 @@ class ScoringTeacher:
     """Digest style with a model that scores: the likeliest available word is the decision, the rest the soft label.
 
     Small models lean towards some words whatever they are told, so the score that a word has under a prompt without
-    content is subtracted first.
+    content is subtracted first. With a `shuffle_seed`, the facts of the available actions change places: the control
+    that shows whether the model uses what it is told.
     """
 
-    def __init__(self, model: Scorer, identity: dict[str, Any], lanes: int) -> None:
-        self.name = str(identity["model"])
-        self._model, self._identity, self._lanes = model, identity, lanes
+    def __init__(self, model: Scorer, identity: dict[str, Any], lanes: int, shuffle_seed: int | None = None) -> None:
+        self.name = str(identity["model"]) + (" (facts shuffled)" if shuffle_seed is not None else "")
+        self._model, self._identity, self._lanes, self._shuffle_seed = model, identity, lanes, shuffle_seed
         self._leaning_A: NDArray[np.float64] | None = None
 
     def describe(self) -> dict[str, Any]:
         """Return the teacher's identity."""
-        return {**self._identity, "style": "digest", "prompt": prompt_version(self._lanes)}
+        return {**self._identity, "style": "digest", "prompt": prompt_version(self._lanes)} | (
+            {} if self._shuffle_seed is None else {"facts": "shuffled"}
+        )
 
     def decide(
         self,
@@ -55,6 +61,12 @@ class ScoringTeacher:
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
         if not all_facts:
             return []
+        if self._shuffle_seed is not None:
+            if keys_B is None:
+                raise RapidError("Shuffled facts are drawn at random: pass `keys_B`, one number per decision.")
+            all_facts = [
+                _shuffled(facts, (self._shuffle_seed, int(key))) for facts, key in zip(all_facts, keys_B, strict=True)
+            ]
         prompts = [digest(facts) for facts in all_facts]
         scores_BA, tokens = self._model.score(
             prompts[0].system, [prompt.user for prompt in prompts], ANSWER_START, _VOCABULARY
@@ -90,6 +102,16 @@ class ScoringTeacher:
         return leaning_A
 
 
+def _shuffled(facts: Facts, key: tuple[int, int]) -> Facts:
+    """Return the facts with those of the available actions dealt out anew."""
+    dealt = np.arange(NUM_ACTIONS)
+    available = list(facts.available)
+    dealt[available] = np.random.default_rng((key[0], key[1] & (2**64 - 1))).permutation(available)
+    return dataclasses.replace(
+        facts, checks=tuple(facts.checks[i] for i in dealt), forecasts=tuple(facts.forecasts[i] for i in dealt)
+    )
+
+
 def softmax_over(scores_A: NDArray[np.float64], available: Sequence[int]) -> NDArray[np.float64]:
     """Return the probabilities of the available actions; the others have none."""
     masked_A = np.full(NUM_ACTIONS, -np.inf)
@@ -100,9 +122,27 @@ def softmax_over(scores_A: NDArray[np.float64], available: Sequence[int]) -> NDA
 
 def make_model_teacher(config: TeacherConfig, lanes: int, seed: int) -> Teacher:
     """Return the teacher of a backend that needs a model; see :func:`rapid.teacher.make_teacher`."""
-    from rapid.teacher.local import LocalModel
+    from rapid.teacher.conversation import ConversingTeacher
+
+    identity = {"backend": config.backend, "model": config.model}
+    if config.backend == "replay":
+        from rapid.teacher.replay import Replay
+
+        return Replay(config, lanes)
+    if config.backend == "endpoint":
+        from rapid.teacher.endpoint import Endpoint
+
+        return ConversingTeacher(Endpoint(config), config, {**identity, "base_url": config.base_url}, lanes)
+    from rapid.teacher.local import LocalChat, LocalModel
     from rapid.teacher.models import dense_folder
 
-    folder, digest, template = dense_folder(config.model)
-    identity = {"backend": "local", "model": config.model, "weights_sha256": digest}
-    return ScoringTeacher(LocalModel(folder, template), identity, lanes)
+    folder, digest_sha256, template = dense_folder(config.model)
+    model = LocalModel(folder, template)
+    identity = {**identity, "weights_sha256": digest_sha256}
+    if config.style == "react":
+        # One conversation after the other: they would compete for the same cores.
+        chat = LocalChat(model, config.max_answer_tokens)
+        return ConversingTeacher(chat, dataclasses.replace(config, concurrency=1), identity, lanes)
+    return ScoringTeacher(
+        model, identity, lanes, stream_seed(seed, "teacher/shuffle") if config.shuffle_facts else None
+    )

@@ -16,6 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rapid.teacher.conversation import Message, Reply
+
 ROWS = 16
 """Prompts in one pass; more gain nothing and cost memory."""
 PAD = 16
@@ -38,7 +40,6 @@ class LocalModel:
     Args:
         folder: ``config.json``, ``model.safetensors`` and ``tokenizer.json``.
         template: name of the chat template.
-        threads: torch threads while scoring; 0 leaves torch's setting.
     """
 
     def __init__(self, folder: Path, template: str = "chatml") -> None:
@@ -143,6 +144,25 @@ class LocalModel:
         return hidden_BTD[torch.arange(len(rows)), last_B][: len(suffixes)], hidden_BTD
 
     @torch.no_grad()
+    def write(self, messages: Sequence[dict[str, Any]], limit: int) -> tuple[str, int, int]:
+        """Return the likeliest answer to a conversation, and the tokens read and written."""
+        text = (
+            "".join(f"<|im_start|>{_role(m)}\n{m['content']}<|im_end|>\n" for m in messages) + "<|im_start|>assistant\n"
+        )
+        ids = torch.tensor([self._encode(text)])
+        stop = self._tokenizer.token_to_id("<|im_end|>")
+        out = self._model.generate(
+            ids,
+            attention_mask=torch.ones_like(ids),
+            do_sample=False,
+            max_new_tokens=limit,
+            eos_token_id=stop,
+            pad_token_id=stop,
+        )
+        written = out[0, ids.shape[1] :].tolist()
+        return self._tokenizer.decode(written), ids.shape[1], len(written)
+
+    @torch.no_grad()
     def _prefix(self, system: str) -> tuple[int, list[tuple[Tensor, Tensor]]]:
         """Return the number of tokens and the key/value cache of the constant part."""
         if system not in self._prefixes:
@@ -150,3 +170,21 @@ class LocalModel:
             cache = self._model.base_model(input_ids=ids, use_cache=True).past_key_values
             self._prefixes[system] = ids.shape[1], [(layer.keys, layer.values) for layer in cache.layers]
         return self._prefixes[system]
+
+
+class LocalChat:
+    """A local model that converses; implements :class:`rapid.teacher.conversation.Chat` with the plain-text protocol."""
+
+    native_tools = False
+
+    def __init__(self, model: LocalModel, limit: int) -> None:
+        self._model, self._limit = model, limit
+
+    def ask(self, messages: Sequence[Message], tools: list[dict[str, Any]], schema: dict[str, Any] | None) -> Reply:
+        """Answer a conversation; tools and schema are described in the messages already."""
+        text, tokens_in, tokens_out = self._model.write(messages, self._limit)
+        return Reply(text, (), tokens_in, tokens_out)
+
+
+def _role(message: dict[str, Any]) -> str:
+    return "user" if message["role"] == "tool" else str(message["role"])
