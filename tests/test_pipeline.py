@@ -1,0 +1,110 @@
+"""The whole job, as small as it gets: what a user sees of it, killed and resumed, and redone from a step."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import rapid
+from rapid import pipeline
+from rapid.config import Config, apply_overrides, preset
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import load_rows
+
+SMALL = {
+    "teacher": {"backend": "scripted", "model": "rule"},
+    "collect": {"teacher_transitions": 40, "random_transitions": 60, "lockstep": 2},
+    "mix": {"size": 40},
+    "network": {"width": 16, "heads": 2, "feedforward": 16},
+    "distill": {"iterations": 6, "evaluate_every": 3, "loss": {"robust": {"steps": 2}}},
+    "adapt": {"steps": 40, "learning_starts": 20, "evaluate_every": 20},
+    "evaluate": {"spawns": 2, "curve_spawns": 1, "attacks": ["none", "uniform", "pgd"]},
+}
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return apply_overrides(preset("strong", "tiny"), SMALL)
+
+
+@pytest.fixture(scope="module")
+def finished(config: Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run") / "run"
+    pipeline.run(config, directory, say=lambda line: None)
+    return directory
+
+
+def artefacts(directory: Path) -> dict[str, bytes]:
+    """What a run computed, without what tells when and how fast."""
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in sorted(directory.rglob("*"))
+        if path.name in ("weights.safetensors", "transitions.parquet")
+    }
+
+
+def test_a_run_leaves_agents_rows_and_a_page(finished: Path):
+    for agent in ("distill/rapid", "distill/offline-dqn", "distill/cloning", "adapt/rapid"):
+        assert rapid.load_agent(finished / agent / "agent").name
+    rows = load_rows(finished / "evaluate" / "episodes.parquet")
+    measured = {row.agent for row in rows}
+    assert {"slower", "idle", "random", "rule", "planner", "behaviour cloning", "offline DQN", "RAPID"} <= measured
+    assert {row.attack for row in rows if row.agent == "RAPID"} == {"none", "uniform", "pgd"}
+    page = (finished / "report.html").read_text()
+    assert "always-slower" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert (finished / "figures" / "results.png").stat().st_size > 10_000
+
+
+def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(finished: Path):
+    before = rapid.load_agent(finished / "distill/rapid/agent").network.state_dict()
+    after = rapid.load_agent(finished / "adapt/rapid/agent").network.state_dict()
+    frozen = [name for name in before if name.startswith("mixture.policies.0.")]
+    assert frozen
+    assert all(before[name].equal(after[name]) for name in frozen)
+    assert any(not before[name].equal(after[name]) for name in before)
+
+
+def test_the_same_command_again_does_nothing(config: Config, finished: Path):
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    said: list[str] = []
+    pipeline.run(config, finished, say=said.append)
+    assert before == {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    assert sum("done before" in line for line in said) == len(pipeline.STEPS)
+
+
+def test_other_settings_and_unknown_steps_are_refused(config: Config, finished: Path):
+    with pytest.raises(RapidError, match="other settings"):
+        pipeline.run(apply_overrides(config, {"seed": 1}), finished, say=lambda line: None)
+    with pytest.raises(RapidError, match="did you mean 'mix'"):
+        pipeline.run(config, finished, "mxi", say=lambda line: None)
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_as_an_uninterrupted_one(config: Config, finished: Path, tmp_path: Path):
+    words = [sys.executable, "-m", "rapid.cli", "run", "--config", str(finished / "config.toml")]
+    words += ["--directory", str(tmp_path / "run")]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "run/steps/mix.json").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "run/steps/report.json").exists()
+    pipeline.run(config, tmp_path / "run", say=lambda line: None)
+    assert artefacts(tmp_path / "run") == artefacts(finished)
+
+
+def test_redoing_a_step_gives_the_same_again(config: Config, finished: Path):
+    before = artefacts(finished)
+    pipeline.run(config, finished, "evaluate", say=lambda line: None)
+    assert artefacts(finished) == before
+
+
+def test_the_page_can_be_written_again(finished: Path):
+    (finished / "report.html").unlink()
+    assert pipeline.report_again(finished).exists()
