@@ -1,0 +1,112 @@
+"""What a model that converses is told, and how its answers are read (paper: appendix "Prompt Setup").
+
+The prefix prompt holds the task, the rules, the output format, the scene, and the previous decision with its reason.
+In `digest` style all tool results stand in it; in `react` style the model asks for them.
+"""
+
+import json
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from rapid.teacher.decision import Decision
+from rapid.teacher.facts import Facts
+from rapid.teacher.prompt import WORDS, Prompt, outcome
+from rapid.teacher.tools import action_named, describe_car, tool_help
+
+EXPLANATION_LIMIT = 300
+"""Characters of an explanation that are kept and fed back."""
+
+DECISION_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "properties": {
+        "explanation": {"type": "string", "description": "one sentence"},
+        "action": {"type": "string", "enum": list(WORDS.values())},
+    },
+    "required": ["explanation", "action"],
+    "additionalProperties": False,
+}
+_FORMAT = 'Give your decision as JSON and nothing else: {"explanation": "one sentence", "action": "ACTION"}'
+_CALL = re.compile(r"^\s*CALL\s+(\w+)\s*(\{.*\})?\s*$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A model's final answer: the action or, if `action` is `None`, what is wrong with it."""
+
+    action: int | None
+    explanation: str = ""
+    fault: str = ""
+
+
+def briefing(facts: Facts, previous: Decision | None, style: str, native_tools: bool) -> Prompt:
+    """Return the first prompt of a conversation; `native_tools` says whether the server knows about tools itself."""
+    scene = facts.scene
+    system = (
+        "You are a careful, experienced driver on a one-way highway with "
+        f"{scene.lanes} lanes; lane 1 is the leftmost. Once a second you choose one action:\n"
+        "left: change one lane to the left; keep: hold lane and speed; right: change one lane to the right; "
+        "faster: speed up by 4 m/s; slower: slow down by 4 m/s.\n"
+        "Rules: never risk a collision; keep to the right where that is safe; drive faster than 20 m/s where that is "
+        "safe; do not change lanes back and forth; if nothing is safe, take what leaves most room.\n"
+    )
+    if style == "react":
+        system += "Think step by step, and use the tools to find out what is possible and safe before you decide.\n"
+        if not native_tools:
+            system += (
+                'To use a tool, write one line and then stop:\nCALL tool_name {"argument": value}\nThe tools are:\n'
+                f"{tool_help()}\n"
+            )
+    system += _FORMAT
+    lines = [f"You are in lane {scene.lane + 1} of {scene.lanes} at {scene.speed:.1f} m/s."]
+    lines += [describe_car(car) for car in scene.cars] or ["No other car is in sight."]
+    if previous:
+        lines.append(f"Your previous decision: {WORDS[previous.action]}. {previous.explanation}".rstrip())
+    if style == "digest":
+        lines.append("What each action leads to in the next 4 s:")
+        lines += [f"{WORDS[action]}: {outcome(facts, action)}" for action in facts.available]
+    return Prompt(system, "\n".join(lines))
+
+
+def read_call(text: str) -> tuple[str, str] | None:
+    """Return the tool and the arguments that a text asks for by ``CALL``, or `None`."""
+    match = _CALL.search(text)
+    return (match[1], match[2] or "{}") if match else None
+
+
+def read_choice(text: str, facts: Facts) -> Choice:
+    """Read a final answer strictly: a JSON object with a known, possible action and an explanation."""
+    if not text.strip():
+        return Choice(None, fault="The answer was empty.")
+    answer = _last_object(text)
+    if answer is None:
+        return Choice(None, fault="The answer holds no JSON object.")
+    action = action_named(answer.get("action"))
+    if action is None:
+        return Choice(None, fault=f"The action {json.dumps(answer.get('action'))[:80]} does not exist.")
+    if action not in facts.available:
+        return Choice(None, fault=f"The action {WORDS[action]} is not possible here.")
+    explanation = answer.get("explanation")
+    return Choice(action, explanation[:EXPLANATION_LIMIT] if isinstance(explanation, str) else "")
+
+
+def repair_request(fault: str, facts: Facts) -> str:
+    """Return the message that asks once for a corrected answer."""
+    return f"{fault} Possible actions: {', '.join(WORDS[action] for action in facts.available)}. {_FORMAT}"
+
+
+def _last_object(text: str) -> dict[str, Any] | None:
+    """Return the last JSON object in a text, whatever stands around it."""
+    decoder = json.JSONDecoder()
+    found: dict[str, Any] | None = None
+    position = text.find("{")
+    while position >= 0:
+        try:
+            value, end = decoder.raw_decode(text, position)
+        except (ValueError, RecursionError):
+            position = text.find("{", position + 1)
+            continue
+        if isinstance(value, dict):
+            found = value
+        position = text.find("{", end)
+    return found

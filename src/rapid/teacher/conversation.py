@@ -1,0 +1,208 @@
+"""A teacher that converses: digest or react, tools, one repair, and a counted fallback; whatever the server does."""
+
+import json
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rapid.config import TeacherConfig
+from rapid.errors import RapidError
+from rapid.teacher.briefing import (
+    DECISION_SCHEMA,
+    EXPLANATION_LIMIT,
+    Choice,
+    briefing,
+    read_call,
+    read_choice,
+    repair_request,
+)
+from rapid.teacher.decision import Decision
+from rapid.teacher.facts import Facts, gather, safest
+from rapid.teacher.prompt import WORDS
+from rapid.teacher.scene import read_scenes
+from rapid.teacher.tools import call_tool, tool_specifications
+
+Message = dict[str, Any]
+
+FAILURES_IN_A_ROW = 5
+"""Conversations lost to the server, one after the other, after which it is taken to be down."""
+
+
+class ChatError(Exception):
+    """The server gave no answer, after all retries; `retries` says how many."""
+
+    def __init__(self, message: str, retries: int = 0) -> None:
+        super().__init__(message)
+        self.retries = retries
+
+
+@dataclass(frozen=True)
+class ToolCall:
+    """A call as the server reports it."""
+
+    id: str
+    name: str
+    arguments: str
+
+
+@dataclass(frozen=True)
+class Reply:
+    """One answer of a model."""
+
+    text: str
+    calls: tuple[ToolCall, ...] = ()
+    tokens_in: int = 0
+    tokens_out: int = 0
+    retries: int = 0
+
+
+class Chat(Protocol):
+    """A model that answers a conversation."""
+
+    @property
+    def native_tools(self) -> bool:
+        """Whether tools are passed beside the messages; if not, the plain-text protocol is used."""
+        ...
+
+    def ask(self, messages: Sequence[Message], tools: list[dict[str, Any]], schema: dict[str, Any] | None) -> Reply:
+        """Answer; `schema` is a wish that the caller checks itself.
+
+        Raises:
+            ChatError: no answer could be had this time.
+            RapidError: none will ever be had: a wrong key, address or model.
+        """
+        ...
+
+
+@dataclass
+class _Talk:
+    """The running account of one conversation."""
+
+    messages: list[Message]
+    tokens_in: int = 0
+    tokens_out: int = 0
+    retries: int = 0
+    answer: str = ""
+    faults: list[str] = field(default_factory=list[str])
+
+    def note(self, reply: Reply) -> None:
+        self.tokens_in += reply.tokens_in
+        self.tokens_out += reply.tokens_out
+        self.retries += reply.retries
+        self.answer = reply.text
+
+
+class ConversingTeacher:
+    """Asks a chat model, world by world, several at once."""
+
+    def __init__(self, chat: Chat, config: TeacherConfig, identity: dict[str, Any], lanes: int) -> None:
+        self.name = f"{config.model} ({config.style})"
+        self._chat, self._config, self._identity, self._lanes = chat, config, identity, lanes
+        self._failures = 0
+
+    def describe(self) -> dict[str, Any]:
+        """Return the teacher's identity."""
+        empty = np.zeros((1, 1, 5), np.float32)
+        prompt = briefing(gather(read_scenes(empty, self._lanes)[0]), None, self._config.style, False)
+        return {**self._identity, "style": self._config.style, "prompt": prompt.hash[:16]}
+
+    def decide(
+        self,
+        obs_BVF: NDArray[np.float32],
+        previous: Sequence[Decision | None],
+        keys_B: NDArray[np.int64] | None = None,
+    ) -> list[Decision]:
+        """Decide for each world; see :meth:`rapid.teacher.decision.Teacher.decide`.
+
+        Raises:
+            RapidError: also if the server refuses the key or the model, or seems to be down.
+        """
+        all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
+        with ThreadPoolExecutor(max(self._config.concurrency, 1)) as pool:
+            decisions = list(pool.map(self._decide, all_facts, previous))
+        for decision in decisions:
+            lost = decision.status == "fallback" and decision.error.startswith("no answer")
+            self._failures = self._failures + 1 if lost else 0
+            if self._failures >= FAILURES_IN_A_ROW:
+                raise RapidError(
+                    f"The model's server failed {self._failures} decisions in a row; the last time: {decision.error}. "
+                    "Is it running and reachable? What was collected is kept: run the same command again."
+                )
+        return decisions
+
+    def _decide(self, facts: Facts, previous: Decision | None) -> Decision:
+        start = time.perf_counter()
+        prompt = briefing(facts, previous, self._config.style, self._chat.native_tools)
+        talk = _Talk([{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}])
+        choice = Choice(None)
+        try:
+            choice = read_choice(self._reason(talk, facts), facts)
+            if choice.action is None:
+                talk.faults.append(choice.fault)
+                choice = read_choice(self._repair(talk, facts), facts)
+                if choice.action is None:
+                    talk.faults.append(choice.fault)
+        except ChatError as error:
+            talk.retries += error.retries
+            talk.faults.append(f"no answer: {error}")
+        status = "ok" if not talk.faults else "repaired"
+        action, explanation = choice.action, choice.explanation
+        if action is None:
+            action, status = safest(facts), "fallback"
+            explanation = f"no usable answer; {WORDS[action]} leaves most room"
+        cost = (talk.tokens_in * self._config.price_in + talk.tokens_out * self._config.price_out) / 1e6
+        return Decision(
+            action,
+            explanation=explanation,
+            answer=talk.answer[: 4 * EXPLANATION_LIMIT],
+            prompt_hash=prompt.hash,
+            status=status,
+            # The transport's error goes first: it says why there was no answer at all.
+            error="; ".join(reversed(talk.faults)),
+            retries=talk.retries,
+            tokens_in=talk.tokens_in,
+            tokens_out=talk.tokens_out,
+            seconds=time.perf_counter() - start,
+            cost=cost,
+            transcript=json.dumps(talk.messages[1:]),
+        )
+
+    def _reason(self, talk: _Talk, facts: Facts) -> str:
+        """Let the model call tools until it answers without a call, or its turns are used up."""
+        if self._config.style == "digest":
+            return self._ask(talk, [], DECISION_SCHEMA).text
+        tools = tool_specifications()
+        for _ in range(self._config.max_turns):
+            reply = self._ask(talk, tools, None)
+            spoken = read_call(reply.text) if not reply.calls else None
+            if reply.calls:
+                for call in reply.calls:
+                    result = call_tool(facts, call.name, call.arguments)
+                    talk.messages.append({"role": "tool", "tool_call_id": call.id, "content": result})
+            elif spoken:
+                talk.messages.append({"role": "user", "content": f"RESULT {call_tool(facts, *spoken)}"})
+            else:
+                return reply.text
+        talk.messages.append({"role": "user", "content": repair_request("No more tool calls.", facts)})
+        return self._ask(talk, [], DECISION_SCHEMA).text
+
+    def _repair(self, talk: _Talk, facts: Facts) -> str:
+        talk.messages.append({"role": "user", "content": repair_request(talk.faults[-1], facts)})
+        return self._ask(talk, [], DECISION_SCHEMA).text
+
+    def _ask(self, talk: _Talk, tools: list[dict[str, Any]], schema: dict[str, Any] | None) -> Reply:
+        reply = self._chat.ask(talk.messages, tools, schema)
+        talk.note(reply)
+        message: Message = {"role": "assistant", "content": reply.text}
+        if reply.calls:
+            message["tool_calls"] = [
+                {"id": call.id, "type": "function", "function": {"name": call.name, "arguments": call.arguments}}
+                for call in reply.calls
+            ]
+        talk.messages.append(message)
+        return reply
