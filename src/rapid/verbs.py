@@ -170,7 +170,7 @@ class VerifySimulator:
 
     episodes: int = 12
     """Episodes in all, shared among the scenarios."""
-    scenario: tuple[str, ...] = ()
+    scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = ()
     """Scenarios; by default the paper's with both dynamics, and others that reach the rest of the configuration."""
     processes: int = 1
     """Processes that drive highway-env, which takes nearly all of the time."""
@@ -244,7 +244,7 @@ def _defaults(kind: type[T], base: Config) -> T:
             values[item.name] = base
         elif item.name == "source":
             values[item.name] = Source(base.recipe, base.scale)
-        elif hasattr(base, item.name) and kind is not VerifySimulator:
+        elif hasattr(base, item.name):
             values[item.name] = getattr(base, item.name)
         elif item.name == "curve_spawns":
             values[item.name] = base.evaluate.curve_spawns
@@ -334,7 +334,7 @@ def _verify(options: VerifySimulator, config: Config) -> int:
 
     with task("verify", options.episodes, "episodes") as work:
         findings = verify(
-            options.scenario or None,
+            options.scenarios or None,
             options.episodes,
             processes=options.processes,
             plain_math=options.plain_math,
