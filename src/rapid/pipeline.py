@@ -3,6 +3,7 @@
 Every function here works on directories, so the verbs of the command line call the same code.
 """
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -73,6 +74,7 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
         "evaluate": _evaluate,
         "report": _report,
     }
+    _warm_up(config, say)
     say(f"run {directory}: {config.scenario}, recipe {config.recipe}, scale {config.scale}, seed {config.seed}")
     for number, step in enumerate(STEPS, 1):
         heading = f"[{number}/{len(STEPS)}] {step}"
@@ -88,6 +90,21 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
     say(f"time: {times}")
     say(f"report: {(home.path / 'report.html').resolve()}")
     return home.path / "report.html"
+
+
+def _warm_up(config: Config, say: Callable[[str], None]) -> None:
+    """Use the simulator and its search once, so that their compilation, if it is due, is not taken for a stall."""
+    if config.simulator != "compiled":
+        return
+    notice = threading.Timer(2.0, say, ("Compiling the simulator for this machine, once: about a minute.",))
+    notice.start()
+    try:
+        worlds = make_vec(config.scenario, 1, autoreset=False)
+        observation, _ = worlds.reset(seed=0)
+        worlds.step(open_agent(PLANNER, config.scenario).bind(worlds).act(observation))
+        worlds.close()
+    finally:
+        notice.cancel()
 
 
 def check(config: Config) -> None:
@@ -240,7 +257,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
 
 
 def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
-    specs = list(FLOORS)
+    specs: list[str] = list(FLOORS)
     if config.evaluate.teacher_spawns:
         specs.append(TEACHER)
     if config.evaluate.planner_spawns and config.simulator == "compiled":
