@@ -276,7 +276,9 @@ def _collect(options: Collect, config: Config) -> int:
     from rapid import pipeline
 
     pipeline.check(config)
-    dataset = pipeline.collect_transitions(config, Path(options.out))
+    # The random driver's transitions are the other source of a mixture, from spawns of their own.
+    uniform = (config.teacher.backend, config.teacher.model) == ("scripted", "random")
+    dataset = pipeline.collect_transitions(config, Path(options.out), "random" if uniform else "teacher")
     print(f"{len(dataset)} transitions in {options.out}")
     return 0
 
