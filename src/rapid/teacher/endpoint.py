@@ -69,7 +69,7 @@ class Endpoint:
                 ) from None
             except openai.NotFoundError as error:
                 raise RapidError(
-                    f"{self._config.base_url} does not know the model '{self._config.model}', or is not an OpenAI-style "
+                    f"{self._config.base_url} does not know the model '{self._config.model}', or is no OpenAI-style "
                     f"address: {self._clean(error)}. Check --teacher.model and --teacher.base-url."
                 ) from None
             except (openai.BadRequestError, openai.UnprocessableEntityError) as error:

@@ -49,9 +49,10 @@ def convert(source: Path, folder: Path) -> None:
 
     try:
         reader = GGUFReader(source)
-    except (OSError, ValueError) as error:
-        raise RapidError(f"'{source}' is not a readable GGUF file: {error}. Fetch it again.") from error
-    fields = {name: field.contents() for name, field in reader.fields.items()}
+        fields = {name: field.contents() for name, field in reader.fields.items()}
+    except (OSError, ValueError, IndexError, KeyError, OverflowError, MemoryError) as error:
+        # The reader trusts the file: one that is cut short or is something else fails in any of these ways.
+        raise RapidError(f"'{source}' is not a whole GGUF file ({error}). Fetch it again.") from error
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -73,6 +74,8 @@ def _config(fields: dict[str, Any], tensors: set[str], source: Path) -> dict[str
         raise RapidError(f"'{source}' holds a model of family '{family}'. Supported: {', '.join(_FAMILIES)}.")
 
     def get(name: str) -> Any:
+        if f"{family}.{name}" not in fields:
+            raise RapidError(f"'{source}' does not say its '{name}': it is not a language model, or is damaged.")
         return fields[f"{family}.{name}"]
 
     return {

@@ -9,7 +9,7 @@ import gc
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,12 +26,16 @@ company, and a prompt's scores are the same bits in any batch (measured on AVX-5
 REMEMBERED = 4096
 """Prompts whose scores are kept."""
 
-_TEMPLATES = {
-    "chatml": (
-        "<|im_start|>system\n{system}<|im_end|>\n<|im_start|>user\n",
-        "{user}<|im_end|>\n<|im_start|>assistant\n",
-    )
-}
+
+class _Template(NamedTuple):
+    """How a chat is written for a model."""
+
+    begin: str
+    end: str
+    stop: str
+
+
+_TEMPLATES = {"chatml": _Template("<|im_start|>{role}\n", "<|im_end|>\n", "<|im_end|>")}
 
 
 class LocalModel:
@@ -51,7 +55,7 @@ class LocalModel:
         self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
         self._model: Any = AutoModelForCausalLM.from_pretrained(folder, dtype=torch.float32).eval()
         self._head: Tensor = self._model.get_output_embeddings().weight.detach()
-        self._start, self._end = _TEMPLATES[template]
+        self._template = _TEMPLATES[template]
         self._prefixes: dict[str, Any] = {}
         self._scores: OrderedDict[tuple[str, str, tuple[str, ...]], tuple[NDArray[np.float64], int]] = OrderedDict()
         gc.collect()
@@ -87,7 +91,10 @@ class LocalModel:
         return np.stack([found[key][0] for key in keys]), [found[key][1] for key in keys]
 
     def _suffix(self, user: str, opening: str) -> list[int]:
-        return self._encode(self._end.format(user=user) + opening)
+        return self._encode(user + self._template.end + self._begin("assistant") + opening)
+
+    def _begin(self, role: str) -> str:
+        return self._template.begin.format(role=role)
 
     def _encode(self, text: str) -> list[int]:
         return self._tokenizer.encode(text, add_special_tokens=False).ids
@@ -146,11 +153,9 @@ class LocalModel:
     @torch.no_grad()
     def write(self, messages: Sequence[dict[str, Any]], limit: int) -> tuple[str, int, int]:
         """Return the likeliest answer to a conversation, and the tokens read and written."""
-        text = (
-            "".join(f"<|im_start|>{_role(m)}\n{m['content']}<|im_end|>\n" for m in messages) + "<|im_start|>assistant\n"
-        )
-        ids = torch.tensor([self._encode(text)])
-        stop = self._tokenizer.token_to_id("<|im_end|>")
+        turns = [self._begin(_role(message)) + message["content"] + self._template.end for message in messages]
+        ids = torch.tensor([self._encode("".join(turns) + self._begin("assistant"))])
+        stop = self._tokenizer.token_to_id(self._template.stop)
         out = self._model.generate(
             ids,
             attention_mask=torch.ones_like(ids),
@@ -166,14 +171,16 @@ class LocalModel:
     def _prefix(self, system: str) -> tuple[int, list[tuple[Tensor, Tensor]]]:
         """Return the number of tokens and the key/value cache of the constant part."""
         if system not in self._prefixes:
-            ids = torch.tensor([self._encode(self._start.format(system=system))])
+            ids = torch.tensor(
+                [self._encode(self._begin("system") + system + self._template.end + self._begin("user"))]
+            )
             cache = self._model.base_model(input_ids=ids, use_cache=True).past_key_values
             self._prefixes[system] = ids.shape[1], [(layer.keys, layer.values) for layer in cache.layers]
         return self._prefixes[system]
 
 
 class LocalChat:
-    """A local model that converses; implements :class:`rapid.teacher.conversation.Chat` with the plain-text protocol."""
+    """A local model that converses (:class:`rapid.teacher.conversation.Chat`), with the plain-text protocol."""
 
     native_tools = False
 

@@ -135,8 +135,8 @@ def pull(name: str) -> Path:
         else:
             return model.path
     raise RapidError(
-        f"The model '{name}' ({model.size / 1e6:.0f} MB) could not be fetched. {'; '.join(reasons)}. Check the network, "
-        f"or put the file {model.file} at '{model.path}' yourself, or use a model that is at hand with "
+        f"The model '{name}' ({model.size / 1e6:.0f} MB) could not be fetched. {'; '.join(reasons)}. Check the network "
+        f"or put {model.file} at '{model.path}' yourself, or use a model that is at hand with "
         "--teacher.model PATH, or a driver without a model with --teacher.backend scripted --teacher.model rule."
     )
 

@@ -127,7 +127,7 @@ def read_scenes(obs_BVF: NDArray[np.float32], lanes: int) -> list[Scene]:
     if not finite_B.all():
         world, row, feature = np.argwhere(~np.isfinite(seen_BVF))[0]
         raise RapidError(
-            f"The observation of world {world} has {seen_BVF[world, row, feature]} as {FEATURES[feature]} of row {row}. "
+            f"Observation {world} has {seen_BVF[world, row, feature]} as {FEATURES[feature]} of row {row}. "
             "Every entry must be a finite number: check the attack or the environment that made it."
         )
     return [_read_scene(obs_VF, lanes) for obs_VF in seen_BVF]

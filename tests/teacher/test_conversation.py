@@ -1,0 +1,140 @@
+"""The decision loop against scripted answers: tools, repair, fallback, accounts."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from rapid.config import TeacherConfig
+from rapid.errors import RapidError
+from rapid.teacher.conversation import ChatError, ConversingTeacher, Reply, ToolCall
+from rapid.teacher.decision import to_record
+from rapid.teacher.facts import gather, safest
+from rapid.teacher.replay import Replay
+from rapid.teacher.scene import read_scenes
+
+KEEP = '{"explanation": "calm road", "action": "keep"}'
+
+
+class Script:
+    """A chat that says the lines it is given, then the last one for ever."""
+
+    def __init__(self, *lines: Reply | Exception, native_tools: bool = True) -> None:
+        self.lines, self.native_tools = list(lines), native_tools
+        self.heard: list[list[dict]] = []
+
+    def ask(self, messages: Sequence[dict], tools: list[dict], schema: dict | None) -> Reply:
+        self.heard.append(list(messages))
+        line = self.lines.pop(0) if len(self.lines) > 1 else self.lines[0]
+        if isinstance(line, Exception):
+            raise line
+        return line
+
+
+def teacher(script, style="digest", **settings):
+    config = TeacherConfig(backend="endpoint", model="m", style=style, concurrency=1, **settings)
+    return ConversingTeacher(script, config, {"model": "m"}, 3)
+
+
+def decide(script, world, style="digest", **settings):
+    return teacher(script, style, **settings).decide(world(cars=((30, 1, 20),)), [None])[0]
+
+
+def test_a_good_answer_is_taken_with_its_account(world):
+    decision = decide(Script(Reply(KEEP, (), 100, 20, 1)), world, price_in=2.0, price_out=10.0)
+    assert (decision.action, decision.explanation, decision.status) == (1, "calm road", "ok")
+    assert (decision.tokens_in, decision.tokens_out, decision.retries) == (100, 20, 1)
+    assert decision.cost == pytest.approx((100 * 2 + 20 * 10) / 1e6)
+    assert json.loads(decision.transcript)[-1] == {"role": "assistant", "content": KEEP}
+
+
+@pytest.mark.parametrize("bad", ["", "no idea", '{"action": "jump"}', '{"action"', "I cannot help with driving."])
+def test_a_bad_answer_is_repaired_once(world, bad):
+    script = Script(Reply(bad, (), 10, 5), Reply(KEEP, (), 10, 5))
+    decision = decide(script, world)
+    assert (decision.action, decision.status, decision.tokens_in) == (1, "repaired", 20)
+    assert decision.error
+    assert "Possible actions" in script.heard[1][-1]["content"]
+
+
+@pytest.mark.parametrize("bad", ["", "no idea", '{"action": "jump"}'])
+def test_two_bad_answers_fall_back_and_are_counted(world, bad):
+    script = Script(Reply(bad))
+    decision = decide(script, world)
+    facts = gather(read_scenes(world(cars=((30, 1, 20),)), 3)[0])
+    assert (decision.action, decision.status) == (safest(facts), "fallback")
+    assert len(script.heard) == 2
+
+
+def test_impossible_actions_are_repaired(world):
+    script = Script(Reply('{"action": "left"}'), Reply(KEEP))
+    decision = teacher(script).decide(world(lane=0), [None])[0]
+    assert (decision.action, decision.status) == (1, "repaired")
+
+
+def test_native_tools_are_called_in_turns(world):
+    calls = (ToolCall("1", "available_actions", "{}"), ToolCall("2", "cars_on_lane", '{"lane": 77}'))
+    script = Script(Reply("", calls), Reply("Thought.\n" + KEEP))
+    decision = decide(script, world, "react")
+    results = [message for message in script.heard[1] if message["role"] == "tool"]
+    assert [message["tool_call_id"] for message in results] == ["1", "2"]
+    assert results[1]["content"].startswith("Error")
+    assert decision.status == "ok"
+
+
+def test_tools_are_called_in_plain_text(world):
+    script = Script(Reply('CALL check_action {"action": "keep"}'), Reply(KEEP), native_tools=False)
+    assert decide(script, world, "react").status == "ok"
+    assert script.heard[1][-1]["content"].startswith("RESULT keep:")
+
+
+def test_endless_tool_calls_end(world):
+    script = Script(Reply("", (ToolCall("1", "available_actions", "{}"),)))
+    decision = decide(script, world, "react", max_turns=3)
+    assert decision.status == "fallback"
+    assert len(script.heard) == 3 + 1 + 1
+
+
+def test_a_dead_server_falls_back_then_stops(world):
+    driver = teacher(Script(ChatError("APIConnectionError: gone", 4)))
+    obs_BVF = world()
+    for _ in range(4):
+        decision = driver.decide(obs_BVF, [None])[0]
+        assert (decision.status, decision.retries) == ("fallback", 4)
+        assert "gone" in decision.error
+    with pytest.raises(RapidError, match="5 decisions in a row"):
+        driver.decide(obs_BVF, [None])
+
+
+def test_the_same_state_gives_the_same_prompt(world):
+    first, second = (decide(Script(Reply(KEEP)), world) for _ in range(2))
+    assert first.prompt_hash == second.prompt_hash
+    last = decide(Script(Reply(KEEP)), world, "react")
+    assert last.prompt_hash != first.prompt_hash
+
+
+def test_recorded_answers_are_repeated(world, crowd, tmp_path):
+    recorded = teacher(Script(Reply(KEEP, (), 9, 9))).decide(crowd, [None] * len(crowd))
+    path = tmp_path / "answers.jsonl"
+    path.write_text("\n".join(json.dumps(to_record(decision)) for decision in recorded))
+    replay = Replay(TeacherConfig(backend="replay", replay_file=str(path)), 3)
+    repeated = replay.decide(crowd, [None] * len(crowd))
+    assert [d.action for d in repeated] == [d.action for d in recorded]
+    assert {(d.tokens_in, d.cost) for d in repeated} == {(0, 0.0)}
+    unknown = replay.decide(world(speed=11.0), [None])[0]
+    assert (unknown.status, unknown.error) == ("fallback", "no recorded answer to this prompt")
+
+
+@pytest.mark.parametrize("content", [None, "", "{", "[]", '{"action": 9}', "{}"])
+def test_broken_recordings_are_refused(tmp_path, content):
+    path = tmp_path / "answers.jsonl"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(RapidError, match="record"):
+        Replay(TeacherConfig(backend="replay", replay_file=str(path)), 3)
+
+
+def test_a_teacher_says_who_it_is():
+    assert set(teacher(Script(Reply(KEEP))).describe()) == {"model", "style", "prompt"}
+    assert teacher(Script(Reply(KEEP))).decide(np.zeros((0, 15, 5), np.float32), []) == []

@@ -1,0 +1,115 @@
+"""Prompts, tools and the reading of answers."""
+
+import json
+
+import pytest
+
+from rapid.scenarios import ACTIONS, FASTER, IDLE
+from rapid.teacher.briefing import briefing, read_call, read_choice
+from rapid.teacher.decision import Decision
+from rapid.teacher.facts import gather
+from rapid.teacher.prompt import WORDS, content_free, digest, digest_system, prompt_version
+from rapid.teacher.scene import read_scenes
+from rapid.teacher.tools import TOOL_NAMES, action_named, call_tool, tool_help, tool_specifications
+
+
+@pytest.fixture
+def facts(world):
+    return gather(read_scenes(world(cars=((30, 1, 20), (-20, 2, 25))), 3)[0])
+
+
+def test_the_digest_offers_every_possible_action_once(crowd):
+    for scene in read_scenes(crowd, 3):
+        facts = gather(scene)
+        prompt = digest(facts)
+        words = [word.strip(" .") for part in prompt.user.split(":")[1:] for word in part.split(".")[0].split(",")]
+        assert sorted(set(words) - {"none"}) == sorted(WORDS[action] for action in facts.available)
+        assert prompt.system == digest_system(3) == content_free(3).system
+
+
+def test_the_digest_calls_safe_what_the_facts_call_safe(crowd):
+    for scene in read_scenes(crowd, 3):
+        facts = gather(scene)
+        named = digest(facts).user.split(". ")[0]
+        if named.startswith("Safe"):
+            for action in facts.available:
+                assert (WORDS[action] in named) == facts.safe(action)
+        else:
+            assert not any(facts.safe(action) for action in facts.available)
+
+
+def test_the_prompt_version_follows_the_road(facts):
+    assert prompt_version(3) == prompt_version(3) != prompt_version(4)
+
+
+def test_the_briefing_feeds_back_the_previous_decision(facts):
+    last = Decision(FASTER, explanation="the road was free")
+    assert "faster. the road was free" in briefing(facts, last, "react", True).user
+    assert "previous" not in briefing(facts, None, "react", True).user
+
+
+def test_tools_stand_in_the_text_only_if_the_server_has_no_calls(facts):
+    assert all(name in briefing(facts, None, "react", False).system for name in TOOL_NAMES)
+    assert not any(name in briefing(facts, None, "react", True).system for name in TOOL_NAMES)
+    assert {tool["function"]["name"] for tool in tool_specifications()} == set(TOOL_NAMES)
+    assert all(name in tool_help() for name in TOOL_NAMES)
+
+
+def test_tools_answer_from_the_facts(facts):
+    assert call_tool(facts, "available_lanes", "{}") == "lane 1, lane 2 (yours), lane 3"
+    assert "car 2: lane 2, 25.0 m ahead, 20.0 m/s" in call_tool(facts, "cars_on_lane", '{"lane": 2}')
+    assert "in conflict with car 2" in call_tool(facts, "check_action", '{"action": "faster"}')
+    assert call_tool(facts, "check_action", '{"action": "slower"}') == "slower: by distance and speed safe."
+    assert call_tool(facts, "forecast_action", '{"action": "keep"}').startswith("keep: in the next 4 s")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("fly", "{}"),
+        ("cars_on_lane", "{}"),
+        ("cars_on_lane", '{"lane": 9}'),
+        ("cars_on_lane", '{"lane": "two"}'),
+        ("cars_on_lane", '{"lane": true}'),
+        ("check_action", '{"action": 3}'),
+        ("check_action", "not json"),
+        ("forecast_action", '["keep"]'),
+    ],
+)
+def test_wrong_calls_are_told_what_is_right(facts, name, arguments):
+    assert call_tool(facts, name, arguments).startswith("Error: ")
+
+
+def test_action_names():
+    assert [action_named(name) for name in ACTIONS] == [0, 1, 2, 3, 4]
+    assert [action_named(word.upper()) for word in WORDS.values()] == list(WORDS)
+    assert action_named("brake") is action_named(None) is action_named(["left"]) is None
+
+
+def test_calls_in_plain_text():
+    assert read_call('I look.\nCALL cars_on_lane {"lane": 2}\n') == ("cars_on_lane", '{"lane": 2}')
+    assert read_call("CALL available_actions") == ("available_actions", "{}")
+    assert read_call("I could CALL a friend") is None
+
+
+@pytest.mark.parametrize(
+    "form", ["{}", "```json\n{}\n```", 'First {{"a": 1}} then {}', "Thought: braces {{ and }} {} done"]
+)
+def test_answers_are_found_wherever_they_stand(facts, form):
+    answer = json.dumps({"explanation": "calm", "action": "keep"})
+    choice = read_choice(form.format(answer), facts)
+    assert (choice.action, choice.explanation) == (IDLE, "calm")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "  ", "keep", '{"action": "keep"', '{"action": "hover"}', '{"action": null}', "[1]", "{" * 3000, "{}"]
+)
+def test_unusable_answers_have_a_fault(facts, text):
+    choice = read_choice(text, facts)
+    assert choice.action is None
+    assert choice.fault
+
+
+def test_impossible_actions_have_a_fault(world):
+    facts = gather(read_scenes(world(lane=0), 3)[0])
+    assert "not possible" in read_choice('{"action": "left"}', facts).fault
