@@ -61,6 +61,7 @@ def make_vec(
     seed: int | None = None,
     config: Mapping[str, Any] | None = None,
     autoreset: bool = True,
+    processes: int = 1,
 ) -> "gymnasium.vector.VectorEnv[Any, Any, Any]":
     """Return `num_envs` worlds of a scenario as a Gymnasium vector environment.
 
@@ -72,14 +73,19 @@ def make_vec(
         config: keys of highway-env's configuration to override, merged as in :func:`make_env`.
         autoreset: whether an ended episode is followed by the next within the same step (SAME_STEP, with ``final_obs``
             and ``final_info`` in the info). If not, ended worlds stand still and earn 0.
+        processes: among how many processes the compiled worlds are divided, this one included; the results are the
+            same. Needs ``if __name__ == "__main__":`` around the work of a script.
 
     Raises:
-        RapidError: an unknown scenario or simulator, no worlds, or a configuration that is not covered.
+        RapidError: an unknown scenario or simulator, no worlds, a configuration that is not covered, or processes that
+            cannot be started.
     """
     if _is_compiled(simulator):
         from rapid.simulator.vector_env import CompiledVectorEnv
 
-        return CompiledVectorEnv(scenario, num_envs, seed, config, autoreset)
+        return CompiledVectorEnv(scenario, num_envs, seed, config, autoreset, processes)
+    if processes != 1:
+        raise RapidError("Only the compiled simulator divides its worlds among processes; use processes=1.")
     from rapid.simulator.reference import make_reference_vec
 
     return make_reference_vec(scenario, num_envs, seed, config, autoreset)

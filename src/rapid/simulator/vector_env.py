@@ -22,6 +22,7 @@ from rapid.simulator.observation import (
     INFO_RIGHT,
     INFO_SPEED,
 )
+from rapid.simulator.pool import WorldPool
 from rapid.simulator.settings import merge_config, read_integer, read_settings
 from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
 from rapid.simulator.step import AUTORESET, FREEZE, allocate_outputs, reset_worlds, seed_worlds, step_worlds
@@ -50,6 +51,7 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         seed: int | None = None,
         config: Mapping[str, Any] | None = None,
         autoreset: bool = True,
+        processes: int = 1,
     ) -> None:
         """Prepare the worlds; the first traffic comes with ``reset``.
 
@@ -59,9 +61,11 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             seed: seeds the first ``reset()`` that is called without one.
             config: keys of highway-env's configuration to override.
             autoreset: whether an ended world begins its next episode within the same step.
+            processes: among how many processes the worlds are divided; the results are the same.
 
         Raises:
-            RapidError: an unknown scenario, a configuration that the compiled simulator does not cover, or no worlds.
+            RapidError: an unknown scenario, a configuration that the compiled simulator does not cover, no worlds, or
+                processes that cannot be started.
         """
         self.scenario = get_scenario(scenario) if isinstance(scenario, str) else scenario
         self.config = merge_config(self.scenario.config(), config)
@@ -76,7 +80,9 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         self.single_observation_space, self.single_action_space = spaces_of(self.settings)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.state: State = allocate(self.num_envs, self.settings)
+        processes = read_integer({"processes": processes}, "processes", 1, 1024)
+        self._pool = WorldPool(self.num_envs, self.settings, self._mode, processes) if processes > 1 else None
+        self.state: State = self._pool.state if self._pool else allocate(self.num_envs, self.settings)
         self._first_seed = seed
         self._seeded = np.zeros(self.num_envs, np.bool_)
         self._ready = np.zeros(self.num_envs, np.bool_)
@@ -116,12 +122,16 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         """Take one decision in every world and let its seconds pass.
 
         Raises:
-            RapidError: a world has not begun, or actions of another shape, type or range than the action space.
+            RapidError: a world has not begun, actions of another shape, type or range than the action space, or a
+                process that died.
         """
         self._require_reset()
         checked = check_actions(actions, self.settings, (self.num_envs,))
-        out = allocate_outputs(self.num_envs, self.settings)
-        step_worlds(self.state, checked, self.settings, self._mode, out)
+        if self._pool is not None:
+            out = self._pool.step(checked)
+        else:
+            out = allocate_outputs(self.num_envs, self.settings)
+            step_worlds(self.state, checked, self.settings, self._mode, out)
         info: dict[str, Any] = {}
         ended = out.terminated | out.truncated
         if self._mode == AUTORESET and ended.any():
@@ -176,6 +186,11 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             self._check_index(index)
         checked = check_actions(actions, self.settings, (len(chosen), None))
         return forecast(self.state.take(chosen), checked, self.settings)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the processes, if there are several. Forgetting the environment does the same."""
+        if self._pool is not None:
+            self._pool.close()
 
     def _seed(self, seed: int | Sequence[int | None] | None, chosen: Mask) -> None:
         if seed is None:
