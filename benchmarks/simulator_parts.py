@@ -6,12 +6,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rapid.simulator import make_env, make_vec
+from rapid.simulator import make_env
 from rapid.simulator.reference import make_reference_vec
 from rapid.simulator.vector_env import CompiledVectorEnv
 
@@ -152,31 +152,48 @@ def first_step(single: bool, cold: bool, times: int) -> dict[str, list[float]]:
 def process_throughput(
     scenario: str, worlds: int, processes: int, blocks: int, seconds: float
 ) -> dict[str, list[float]]:
-    """Return decisions per second on the wall with one process and with several, and their ratio, block by block."""
-    envs = [make_vec(scenario, worlds, processes=count) for count in (1, processes)]
-    found: dict[str, list[float]] = {"one": [], "several": [], "ratio": []}
+    """Return decisions per second on the wall with one process and with several, and their ratio, block by block.
+
+    ``ratio_cpu`` compares decisions per second of CPU time of the busiest process; empty where that cannot be read.
+    """
+    one, several = (CompiledVectorEnv(scenario, worlds, processes=count) for count in (1, processes))
+    found: dict[str, list[float]] = {"one": [], "several": [], "ratio": [], "ratio_cpu": []}
     try:
-        for env in envs:
+        for env in (one, several):
             env.reset(seed=0)
             env.step(np.ones(worlds, np.int64))
         generator = np.random.default_rng(0)
         for _ in range(blocks):
             # One, several, several, one: what else the machine does changes slowly and weighs on both alike.
-            rates = [_rate(envs[which], worlds, generator, seconds / 2) for which in (0, 1, 1, 0)]
-            one, several = (rates[0] + rates[3]) / 2, (rates[1] + rates[2]) / 2
-            found["one"].append(one)
-            found["several"].append(several)
-            found["ratio"].append(several / one)
+            rates = [_rate(env, worlds, generator, seconds / 2) for env in (one, several, several, one)]
+            wall, cpu = (
+                [(pair[i] + other[i]) / 2 for pair, other in ((rates[0], rates[3]), rates[1:3])] for i in (0, 1)
+            )
+            found["one"].append(wall[0])
+            found["several"].append(wall[1])
+            found["ratio"].append(wall[1] / wall[0])
+            if np.isfinite(cpu).all():
+                found["ratio_cpu"].append(cpu[1] / cpu[0])
     finally:
-        for env in envs:
+        for env in (one, several):
             env.close()
     return found
 
 
-def _rate(env: Any, worlds: int, generator: np.random.Generator, seconds: float) -> float:
-    step: Callable[[Any], Any] = env.step
-    count, start = 0, time.perf_counter()
+def _rate(env: CompiledVectorEnv, worlds: int, generator: np.random.Generator, seconds: float) -> tuple[float, float]:
+    workers = env._pool._workers if env._pool is not None else []
+    pids = [os.getpid(), *(worker.pid for worker in workers)]
+    count, start, before = 0, time.perf_counter(), [_cpu_time(pid) for pid in pids]
     while (spent := time.perf_counter() - start) < seconds:
-        step(generator.integers(0, 5, worlds))
+        env.step(generator.integers(0, 5, worlds))
         count += worlds
-    return count / spent
+    busiest = max(_cpu_time(pid) - earlier for pid, earlier in zip(pids, before, strict=True))
+    return count / spent, count / busiest
+
+
+def _cpu_time(pid: int) -> float:
+    """Return the CPU time of a process [s], nan where the system does not tell it."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9
+    except (OSError, ValueError):
+        return float("nan")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rapid.errors import RapidError
 from rapid.scenarios import ACTIONS, Scenario, get_scenario
+from rapid.simulator import startup
 from rapid.simulator.observation import (
     INFO_COLLISION,
     INFO_CRASHED,
@@ -29,6 +30,8 @@ from rapid.simulator.step import (
     step_worlds,
 )
 from rapid.simulator.stream import set_generator, stream_of
+
+startup.load_numba()
 
 
 class Forecast(NamedTuple):

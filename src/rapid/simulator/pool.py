@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
+from rapid.simulator import startup
 from rapid.simulator.settings import Settings
 from rapid.simulator.state import State, allocate
 from rapid.simulator.step import Outputs, allocate_outputs, step_worlds
+
+startup.load_numba()
 
 _STEP, _STOP, _READY = b"step", b"stop", b"ready"
 _ALIGNMENT = 64
