@@ -1,6 +1,7 @@
 """The measurements of the simulator's benchmark: interleaved against highway-env, first step, processes."""
 
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -181,8 +182,7 @@ def process_throughput(
 
 
 def _rate(env: CompiledVectorEnv, worlds: int, generator: np.random.Generator, seconds: float) -> tuple[float, float]:
-    workers = env._pool._workers if env._pool is not None else []
-    pids = [os.getpid(), *(worker.pid for worker in workers)]
+    pids = [os.getpid(), *(child.pid for child in multiprocessing.active_children() if child.pid is not None)]
     count, start, before = 0, time.perf_counter(), [_cpu_time(pid) for pid in pids]
     while (spent := time.perf_counter() - start) < seconds:
         env.step(generator.integers(0, 5, worlds))

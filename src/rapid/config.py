@@ -210,7 +210,7 @@ class DistillConfig:
     """Gradient steps between two evaluations; 0 is never."""
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss of this phase."""
-    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    optimizer: OptimizerConfig = field(default_factory=lambda: OptimizerConfig(learning_rate=1e-3))
     """The optimiser of this phase."""
 
 
@@ -220,9 +220,9 @@ class AdaptConfig:
 
     steps: int = 10_000
     """Environment steps, all worlds together."""
-    num_envs: int = 1
+    num_envs: int = 10
     """Worlds stepped at once; 1 is the paper's setting."""
-    updates_per_step: float = 1.0
+    updates_per_step: float = 0.2
     """Gradient steps per environment step."""
     scenario: str = ""
     """Target scenario; empty is the scenario of the data."""
@@ -230,13 +230,13 @@ class AdaptConfig:
     """Capacity of the replay buffer."""
     learning_starts: int = 500
     """Environment steps before the first gradient step."""
-    exploration_start: float = 1.0
-    """epsilon of epsilon-greedy at the first step."""
+    exploration_start: float = 0.3
+    """epsilon of epsilon-greedy at the first step; the paper's 1 forgets for a while what was distilled."""
     exploration_end: float = 0.05
     """epsilon after the schedule."""
     exploration_share: float = 0.2
     """Share of the steps over which epsilon falls."""
-    offline_share: float = 0.0
+    offline_share: float = 0.25
     """Share of each batch taken from the offline data."""
     train: Literal["adapter", "all", "scratch"] = "adapter"
     """`adapter` is the method: policy 1 frozen. `all` fine-tunes every weight. `scratch` starts from new weights."""
@@ -326,6 +326,10 @@ def _paper(config: Config) -> Config:
         network=NetworkConfig(decoder_layers=2, input="raw", position="learned", mask_absent=False),
         distill=DistillConfig(iterations=5_000, loss=loss, optimizer=optimizer),
         adapt=AdaptConfig(
+            num_envs=1,
+            updates_per_step=1.0,
+            exploration_start=1.0,
+            offline_share=0.0,
             learning_starts=32,
             loss=replace(loss, conservative_weight=0.0, robust_weight=0.0),
             optimizer=optimizer,
@@ -342,23 +346,23 @@ def _resize(config: Config) -> Config:
         config,
         collect=replace(
             config.collect,
-            teacher_transitions=60 if tiny else 1_000,
-            random_transitions=180 if tiny else 3_000,
+            teacher_transitions=60 if tiny else 2_000,
+            random_transitions=180 if tiny else 6_000,
             lockstep=4 if tiny else 16,
         ),
-        mix=replace(config.mix, size=200 if tiny else 4_000),
-        distill=replace(config.distill, iterations=40 if tiny else 2_000, evaluate_every=20 if tiny else 500),
+        mix=replace(config.mix, size=200 if tiny else 8_000),
+        distill=replace(config.distill, iterations=40 if tiny else 800, evaluate_every=20 if tiny else 200),
         adapt=replace(
             config.adapt,
-            steps=200 if tiny else 10_000,
+            steps=200 if tiny else 8_000,
             learning_starts=50 if tiny else 500,
-            evaluate_every=100 if tiny else 2_000,
+            evaluate_every=100 if tiny else 1_000,
         ),
         evaluate=replace(
             config.evaluate,
-            spawns=4 if tiny else 100,
-            teacher_spawns=2 if tiny else 16,
-            planner_spawns=2 if tiny else 20,
+            spawns=4 if tiny else 60,
+            teacher_spawns=2 if tiny else 12,
+            planner_spawns=2 if tiny else 12,
             curve_spawns=2 if tiny else 20,
         ),
     )

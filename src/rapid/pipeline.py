@@ -258,7 +258,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
 
 def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
     specs: list[str] = list(FLOORS)
-    if config.evaluate.teacher_spawns:
+    is_floor = config.teacher.backend == "scripted" and config.teacher.model in FLOORS
+    if config.evaluate.teacher_spawns and not is_floor:
         specs.append(TEACHER)
     if config.evaluate.planner_spawns and config.simulator == "compiled":
         specs.append(PLANNER)

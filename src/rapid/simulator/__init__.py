@@ -62,6 +62,7 @@ def make_vec(
     config: Mapping[str, Any] | None = None,
     autoreset: bool = True,
     processes: int = 1,
+    render_mode: str | None = None,
 ) -> "gymnasium.vector.VectorEnv[Any, Any, Any]":
     """Return `num_envs` worlds of a scenario as a Gymnasium vector environment.
 
@@ -75,6 +76,7 @@ def make_vec(
             and ``final_info`` in the info). If not, ended worlds stand still and earn 0.
         processes: among how many processes the compiled worlds are divided, this one included; the results are the
             same. Needs ``if __name__ == "__main__":`` around the work of a script.
+        render_mode: None, or "rgb_array" for pictures of the first compiled worlds.
 
     Raises:
         RapidError: an unknown scenario or simulator, no worlds, a configuration that is not covered, or processes that
@@ -83,9 +85,9 @@ def make_vec(
     if _is_compiled(simulator):
         from rapid.simulator.vector_env import CompiledVectorEnv
 
-        return CompiledVectorEnv(scenario, num_envs, seed, config, autoreset, processes)
-    if processes != 1:
-        raise RapidError("Only the compiled simulator divides its worlds among processes; use processes=1.")
+        return CompiledVectorEnv(scenario, num_envs, seed, config, autoreset, processes, render_mode)
+    if processes != 1 or render_mode is not None:
+        raise RapidError("Only the compiled simulator has processes and render_mode for many worlds; leave them out.")
     from rapid.simulator.reference import make_reference_vec
 
     return make_reference_vec(scenario, num_envs, seed, config, autoreset)

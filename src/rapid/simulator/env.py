@@ -1,6 +1,6 @@
 """One compiled world as a Gymnasium environment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import Any, NamedTuple, SupportsInt, cast
 
 import gymnasium
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
-from rapid.scenarios import ACTIONS, Scenario, get_scenario
+from rapid.scenarios import ACTIONS, IDLE, Scenario, get_scenario
 from rapid.simulator import startup
 from rapid.simulator.observation import (
     INFO_COLLISION,
@@ -20,6 +20,7 @@ from rapid.simulator.observation import (
     INFO_RIGHT,
     INFO_SPEED,
 )
+from rapid.simulator.render import RENDER_MODES, Frame, Window, draw, read_view
 from rapid.simulator.settings import Settings, merge_config, read_settings
 from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
 from rapid.simulator.step import (
@@ -54,7 +55,7 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
     As in highway-env, a step after the end of an episode drives on.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium declares it mutable
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 1}  # noqa: RUF012 - as Gymnasium has it
 
     def __init__(
         self,
@@ -66,22 +67,23 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
 
         Args:
             scenario: a name such as ``lane-3-density-2``, or a :class:`~rapid.scenarios.Scenario`.
-            render_mode: None; the compiled simulator draws nothing.
+            render_mode: None; "rgb_array", for pictures and videos; or "human", which shows each decision frame by
+                frame in a window.
             config: keys of highway-env's configuration to override.
 
         Raises:
-            RapidError: an unknown scenario, a configuration that the compiled simulator does not cover, or a
-                render mode.
+            RapidError: an unknown scenario or render mode, or a configuration that the compiled simulator does not
+                cover.
         """
-        if render_mode is not None:
-            raise RapidError(
-                f"The compiled simulator has no render mode {render_mode!r}; make the environment with "
-                'simulator="highway-env" to draw it.'
-            )
         self.scenario = get_scenario(scenario) if isinstance(scenario, str) else scenario
         self.config = merge_config(self.scenario.config(), config)
-        self.render_mode = None
         self.settings = read_settings(self.config, self.scenario.dynamics)
+        self.render_mode = check_render_mode(render_mode, RENDER_MODES)
+        self.metadata = self.metadata | {"render_fps": max(round(1 / self.settings.decision_time), 1)}
+        self._view = read_view(self.config, self.settings) if render_mode else None
+        self._window: Window | None = None
+        self._film: Any = None
+        self._shown: Snapshot | None = None
         self.observation_space, self.action_space = spaces_of(self.settings)
         self.state: State = allocate(1, self.settings)
         self._out = allocate_outputs(1, self.settings)
@@ -105,6 +107,8 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         reset_worlds(self.state, np.ones(1, np.bool_), self.settings, self._out)
         set_generator(self.np_random, self.state.stream[0])
         self._ready = True
+        if self.render_mode == "human":
+            self._show()
         return self._out.observations[0].copy(), info_of(self._out.info[0])
 
     def step(self, action: SupportsInt) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -118,8 +122,12 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         """
         self._require_reset()
         actions = check_actions(action, self.settings, ())
-        out = self._out
+        out, before = self._out, None
+        if self.render_mode == "human" or self._film is not None:
+            before = self.state.copy()
         step_worlds(self.state, actions.reshape(1), self.settings, CONTINUE, out)
+        if before is not None:
+            self._play(before, int(actions))
         return (
             out.observations[0].copy(),
             float(out.rewards[0]),
@@ -159,9 +167,76 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         several = forecast(self.state.copy(), chosen.reshape(1, -1), self.settings)
         return Forecast(*(array[0] for array in several))
 
+    def render(self) -> Frame | None:  # type: ignore[override]  # Gymnasium's type of a frame is free
+        """Return a picture of the world from above, uint8 (height, width, 3); None in a window.
+
+        Raises:
+            RapidError: no render mode was chosen, or no episode has begun.
+        """
+        self._require_reset()
+        if self._view is None:
+            raise RapidError('This environment draws nothing. Make it with render_mode="rgb_array" or "human".')
+        if self.render_mode == "human":
+            return self._show()
+        return draw(self._shown or snapshot(self.state, 0), self.settings, self._view)
+
+    def set_record_video_wrapper(self, wrapper: Any) -> None:
+        """Let a ``gymnasium.wrappers.RecordVideo`` around this environment film every frame of a decision.
+
+        Without this its videos have one picture per decision.
+        """
+        self._film = wrapper
+        self.metadata["render_fps"] = max(round(1 / self.settings.dt), 1)
+        if hasattr(wrapper, "frames_per_sec"):
+            wrapper.frames_per_sec = self.metadata["render_fps"]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+
+    def _show(self, world: Snapshot | None = None) -> None:
+        assert self._view is not None
+        if self._window is None:
+            self._window = Window(self._view, 1 / self.settings.dt)
+        self._window.show(draw(world or snapshot(self.state, 0), self.settings, self._view))
+
+    def _play(self, before: State, action: int) -> None:
+        """Show or film the decision that was just driven."""
+        for world in _frames_between(before, action, self.settings):
+            self._shown = world
+            if self.render_mode == "human":
+                self._show(world)
+            elif getattr(self._film, "recording", True):
+                self._film._capture_frame()
+        self._shown = None
+        if self.render_mode == "human":
+            self._show()
+
     def _require_reset(self) -> None:
         if not self._ready:
             raise RapidError("No episode has begun. Call reset() first.")
+
+
+def check_render_mode(mode: str | None, modes: Sequence[str]) -> str | None:
+    """Return a render mode.
+
+    Raises:
+        RapidError: it is none of these.
+    """
+    if mode is not None and mode not in modes:
+        raise RapidError(f"Unknown render mode {mode!r}; expected None or one of: {', '.join(modes)}.")
+    return mode
+
+
+def _frames_between(before: State, action: int, settings: Settings) -> Generator[Snapshot]:
+    """Drive a copy of one world through a decision frame by frame, and yield it after each frame but the last."""
+    single = settings._replace(frames=1, decision_time=settings.dt)
+    out = allocate_outputs(1, settings)
+    idle = int(np.flatnonzero(settings.actions == IDLE)[0])  # the action is taken on the first frame only
+    for frame in range(settings.frames - 1):
+        step_worlds(before, np.array([idle if frame else action]), single, CONTINUE, out)
+        yield snapshot(before, 0)
 
 
 def spaces_of(settings: Settings) -> tuple["gymnasium.Space[NDArray[np.float32]]", "gymnasium.Space[np.int64]"]:

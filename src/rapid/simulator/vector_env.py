@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rapid.errors import RapidError
 from rapid.scenarios import Scenario, get_scenario
-from rapid.simulator.env import Forecast, check_actions, forecast, spaces_of
+from rapid.simulator.env import Forecast, check_actions, check_render_mode, forecast, spaces_of
 from rapid.simulator.observation import (
     INFO_COLLISION,
     INFO_CRASHED,
@@ -23,12 +23,15 @@ from rapid.simulator.observation import (
     INFO_SPEED,
 )
 from rapid.simulator.pool import WorldPool
+from rapid.simulator.render import Frame, draw, read_view
 from rapid.simulator.settings import merge_config, read_integer, read_settings
 from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
 from rapid.simulator.step import AUTORESET, FREEZE, allocate_outputs, reset_worlds, seed_worlds, step_worlds
 from rapid.simulator.stream import stream_of
 
 Mask = NDArray[np.bool_]
+RENDERED = 16
+"""Worlds that are drawn at most."""
 
 
 class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
@@ -52,6 +55,7 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         config: Mapping[str, Any] | None = None,
         autoreset: bool = True,
         processes: int = 1,
+        render_mode: str | None = None,
     ) -> None:
         """Prepare the worlds; the first traffic comes with ``reset``.
 
@@ -62,6 +66,7 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             config: keys of highway-env's configuration to override.
             autoreset: whether an ended world begins its next episode within the same step.
             processes: among how many processes the worlds are divided; the results are the same.
+            render_mode: None, or "rgb_array" for pictures of the first worlds.
 
         Raises:
             RapidError: an unknown scenario, a configuration that the compiled simulator does not cover, no worlds, or
@@ -71,10 +76,12 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         self.config = merge_config(self.scenario.config(), config)
         self.settings = read_settings(self.config, self.scenario.dynamics)
         self.num_envs = read_integer({"num_envs": num_envs}, "num_envs", 1, 1_000_000)
-        self.render_mode = None
+        self.render_mode = check_render_mode(render_mode, ("rgb_array",))
+        self._view = read_view(self.config, self.settings) if render_mode else None
         self._mode = AUTORESET if autoreset else FREEZE
         self.metadata = {
-            "render_modes": [],
+            "render_modes": ["rgb_array"],
+            "render_fps": max(round(1 / self.settings.decision_time), 1),
             "autoreset_mode": AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED,
         }
         self.single_observation_space, self.single_action_space = spaces_of(self.settings)
@@ -186,6 +193,18 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             self._check_index(index)
         checked = check_actions(actions, self.settings, (len(chosen), None))
         return forecast(self.state.take(chosen), checked, self.settings)
+
+    def render(self) -> tuple[Frame, ...]:  # type: ignore[override]  # Gymnasium's type of a frame is free
+        """Return pictures of the first worlds, at most :data:`RENDERED`, each uint8 (height, width, 3).
+
+        Raises:
+            RapidError: no render mode was chosen, or a world has not begun.
+        """
+        self._require_reset()
+        if self._view is None:
+            raise RapidError('This environment draws nothing. Make it with render_mode="rgb_array".')
+        count = min(self.num_envs, RENDERED)
+        return tuple(draw(snapshot(self.state, i), self.settings, self._view) for i in range(count))
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the processes, if there are several. Forgetting the environment does the same."""
