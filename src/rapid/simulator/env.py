@@ -127,7 +127,7 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             before = self.state.copy()
         step_worlds(self.state, actions.reshape(1), self.settings, CONTINUE, out)
         if before is not None:
-            self._play(before, int(actions))
+            self._play(before, int(actions.reshape(1)[0]))
         return (
             out.observations[0].copy(),
             float(out.rewards[0]),
