@@ -35,6 +35,13 @@ def test_version():
     assert run_cli("--version")[:2] == (0, f"rapid {rapid.__version__}\n")
 
 
+def test_verbs_without_options_run(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stop:
+        main(["models"])
+    assert stop.value.code == 0
+    assert "smollm2-135m" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

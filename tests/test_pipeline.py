@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -109,3 +110,31 @@ def test_redoing_a_step_gives_the_same_again(config: Config, finished: Path):
 def test_the_page_can_be_written_again(finished: Path):
     (finished / "report.html").unlink()
     assert pipeline.report_again(finished).exists()
+
+
+def test_a_comparison_goes_on_only_with_the_same_request(config: Config, finished: Path, tmp_path: Path):
+    agent = str(finished / "distill/offline-dqn/agent")
+    out = tmp_path / "comparison"
+    rows = pipeline.compare(config, ["slower", agent], out)
+    assert {row.agent for row in rows} == {"slower", "offline DQN"}
+    assert (out / "results.png").exists()
+    assert pipeline.compare(config, ["slower", agent], out) == rows
+    with pytest.raises(RapidError, match="Choose another --out"):
+        pipeline.compare(config, ["idle", agent], out)
+
+
+def test_adapting_needs_no_dataset(config: Config, finished: Path, tmp_path: Path):
+    agent = pipeline.adapt_agent(config, finished / "distill/rapid/agent", None, tmp_path / "adapted")
+    assert rapid.load_agent(tmp_path / "adapted" / "agent").name == agent.name
+
+
+def test_a_damaged_artefact_stops_the_run_and_is_left_as_it_is(config: Config, finished: Path, tmp_path: Path):
+    directory = tmp_path / "run"
+    shutil.copytree(finished, directory)
+    for step in pipeline.STEPS[1:]:
+        (directory / "steps" / f"{step}.json").unlink()
+    damaged = directory / "collect/teacher/transitions.parquet"
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    with pytest.raises(RapidError, match="cut off"):
+        pipeline.run(config, directory, say=lambda line: None)
+    assert damaged.stat().st_size == 1000

@@ -22,7 +22,7 @@ from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
-from rapid.files import read_json, write_text
+from rapid.files import read_json, sha256, write_json, write_text
 from rapid.networks.agent import QAgent, load_agent, save_agent
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.progress import format_seconds, task
@@ -236,10 +236,11 @@ def _adapt(config: Config, home: RunDirectory) -> dict[str, Any]:
 def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name: str = "RAPID") -> QAgent:
     """Let the agent in `agent` learn online in the target scenario; it is written to ``out/agent``."""
     scenario = config.adapt.scenario or config.scenario
-    with task(f"adapt, {name}", config.adapt.steps, "steps") as work:
+    settings = config.adapt if data else replace(config.adapt, offline_share=0.0)
+    with task(f"adapt, {name}", settings.steps, "steps") as work:
         network = adapt(
             load_agent(agent, config.device).network,
-            config.adapt,
+            settings,
             scenario,
             out,
             seed=stream_seed(config.seed, "adapt"),
@@ -274,6 +275,18 @@ def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]
     check(config)
     for spec in specs:
         _open(config, spec, config.scenario)
+    request = {
+        "agents": {spec: sha256(Path(spec) / "config.json") if Path(spec).is_dir() else "" for spec in specs},
+        "scenario": config.scenario,
+        "simulator": config.simulator,
+        "seed": config.seed,
+        "evaluate": to_dict(config.evaluate) | {"attacks": list(config.evaluate.attacks)},
+    }
+    if out.exists() and any(out.iterdir()):
+        if not (out / "request.json").exists() or read_json(out / "request.json") != request:
+            raise RapidError(f"'{out}' holds something else than this comparison. Choose another --out, or empty it.")
+    else:
+        write_json(out / "request.json", request)
     rows = _measure(config, config.scenario, specs, out)
     write_figures(ReportData(title=f"{config.scenario}", rows=rows), out)
     return rows

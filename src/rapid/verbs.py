@@ -23,6 +23,7 @@ from rapid.config import (
     Scale,
     TeacherConfig,
 )
+from rapid.errors import RapidError
 
 T = TypeVar("T")
 
@@ -118,7 +119,7 @@ class Adapt:
     """Directory of the agent."""
     adapt: Flat[AdaptConfig] = field(default_factory=AdaptConfig)
     dataset: str = ""
-    """Offline dataset: for --offline-share, and to measure what is forgotten."""
+    """Offline dataset: for --offline-share, which is 0 without it, and to measure what is forgotten."""
     out: str = "adapted"
     """Directory of the adapted agent and its training record."""
     curve_spawns: int = EvaluateConfig.curve_spawns
@@ -228,9 +229,9 @@ def _base_settings(words: Sequence[str]) -> Config:
 
 def _option(words: Sequence[str], name: str) -> str:
     """The value of ``--name value`` or ``--name=value`` among `words`, or an empty string."""
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for i, word in enumerate(words):
         if word == f"--{name}":
-            return following
+            return words[i + 1] if i + 1 < len(words) else ""
         if word.startswith(f"--{name}="):
             return word.partition("=")[2]
     return ""
@@ -286,7 +287,10 @@ def _collect(options: Collect, config: Config) -> int:
 def _mix(options: Mix, config: Config) -> int:
     from rapid import pipeline
 
-    mixed = pipeline.mix_datasets(config, Path(options.teacher_data), Path(options.random_data), Path(options.out))
+    out = Path(options.out)
+    if out.exists() and any(out.iterdir()):
+        raise RapidError(f"'{out}' exists and is not empty. Choose another --out, so that nothing is overwritten.")
+    mixed = pipeline.mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
     print(f"{len(mixed)} transitions in {options.out}")
     return 0
 
