@@ -47,18 +47,18 @@ $(VENV)/.python:
 $(VENV)/.torch: $(VENV)/.python constraints.txt
 	@echo 'Installing torch ...'
 	@if [ "$$(uname -s)" = Linux ] && ! command -v nvidia-smi >/dev/null 2>&1; then \
-	  $(PIP) install -q --retries 0 --timeout 20 --no-deps --index-url $(CPU_INDEX) $(TORCH) 2>/dev/null \
+	  $(PIP) install -qq --retries 0 --timeout 20 --no-deps --index-url $(CPU_INDEX) $(TORCH) 2>/dev/null \
 	  || { echo 'The index of CPU builds cannot be reached; asking the usual sources (the file may be large).'; \
-	       $(PIP) install -q -c constraints.txt $(TORCH); }; \
-	else $(PIP) install -q -c constraints.txt $(TORCH); fi
+	       $(PIP) install -qq -c constraints.txt $(TORCH); }; \
+	else $(PIP) install -qq -c constraints.txt $(TORCH); fi
 	@touch $@
 
 $(VENV)/.installed: $(VENV)/.torch pyproject.toml constraints.txt
 	@echo 'Installing RAPID and what it needs ...'
-	@$(PIP) install -q -c constraints.txt -e .
+	@$(PIP) install -qq -c constraints.txt -e .
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo 'Installing the development tools ...'
-	@$(PIP) install -q -c constraints.txt -e '.[dev,minari,export]'
+	@$(PIP) install -qq -c constraints.txt -e '.[dev,minari,export]'
 	@touch $@
