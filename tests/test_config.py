@@ -92,6 +92,10 @@ def test_wrong_settings_are_named(overrides: dict[str, Any], says: str):
         ({"distill": {"loss": {"discount": -0.1}}}, "distill.loss.discount"),
         ({"adapt": {"optimizer": {"target_rate": 0.0}}}, "adapt.optimizer.target_rate"),
         ({"adapt": {"scenario": "lane-x"}}, "scenario"),
+        ({"collect": {"max_cost": float("inf")}}, "collect.max_cost"),
+        ({"network": {"width": 0}}, "network.width"),
+        ({"distill": {"iterations": 0}}, "distill.iterations"),
+        ({"evaluate": {"attacks": []}}, "evaluate.attacks"),
     ],
 )
 def test_impossible_numbers_are_refused(overrides: dict[str, Any], setting: str):

@@ -72,10 +72,10 @@ def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(fin
 
 
 def test_the_same_command_again_does_nothing(config: Config, finished: Path):
-    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.name != "lock"}
     said: list[str] = []
     pipeline.run(config, finished, say=said.append)
-    assert before == {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    assert before == {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.name != "lock"}
     assert sum("done before" in line for line in said) == len(pipeline.STEPS)
 
 
@@ -121,6 +121,31 @@ def test_a_comparison_goes_on_only_with_the_same_request(config: Config, finishe
     assert pipeline.compare(config, ["slower", agent], out) == rows
     with pytest.raises(RapidError, match="Choose another --out"):
         pipeline.compare(config, ["idle", agent], out)
+
+
+def test_two_agents_of_one_name_stay_apart(config: Config, finished: Path, tmp_path: Path):
+    agent = finished / "distill/offline-dqn/agent"
+    shutil.copytree(agent, tmp_path / "other")
+    rows = pipeline.compare(config, [str(agent), str(tmp_path / "other")], tmp_path / "comparison")
+    assert {row.agent for row in rows} == {f"offline DQN ({path})" for path in (agent, tmp_path / "other")}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        ({"network": {"kind": "attentive"}}, "has no adapter"),
+        ({"mix": {"size": 400}}, "collect.teacher_transitions"),
+        ({"mix": {"p": 0.0}, "collect": {"teacher_transitions": 0}}, "collect.teacher_transitions"),
+        ({"evaluate": {"attacks": ["pdg"]}}, "did you mean 'pgd'"),
+        ({"device": "tpu"}, "--device cpu"),
+    ],
+)
+def test_steps_that_cannot_follow_are_refused_before_any_work(
+    config: Config, tmp_path: Path, overrides: dict[str, object], says: str
+):
+    with pytest.raises(RapidError, match=says):
+        pipeline.run(apply_overrides(config, overrides), tmp_path / "run", say=lambda line: None)
+    assert not (tmp_path / "run").exists()
 
 
 def test_adapting_needs_no_dataset(config: Config, finished: Path, tmp_path: Path):

@@ -61,3 +61,12 @@ def test_foreign_and_damaged_directories_are_left_alone(tmp_path: Path):
     (other / "run.json").write_text('{"format": 99}')
     with pytest.raises(RapidError, match="another version"):
         RunDirectory(other, preset(), STEPS)
+
+
+def test_a_step_counts_only_with_all_before_it(tmp_path: Path):
+    run = RunDirectory(tmp_path, preset(), STEPS)
+    run.finish("distill", 1)
+    assert not run.is_done("distill")
+    run.finish("collect", 1)
+    run.finish("mix", 1)
+    assert run.is_done("distill")

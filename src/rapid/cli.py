@@ -67,12 +67,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         if debug:
             raise
-        print("\nrapid: interrupted; the same command goes on from here.", file=sys.stderr)
+        print("\nrapid: interrupted. What is done is kept: the same command, without --from, goes on.", file=sys.stderr)
         raise SystemExit(130) from None
     except BrokenPipeError:
         # The reader of our output went away (`rapid ... | head`): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None
+    except OSError as error:
+        if debug:
+            raise
+        print(
+            f"rapid: The system refused: {error}. Check the path, its permissions and the free space.", file=sys.stderr
+        )
+        raise SystemExit(2) from None
     raise SystemExit(code)
 
 

@@ -8,6 +8,7 @@ A *recipe* says how things are trained: ``paper`` uses the numbers as printed, e
 
 import dataclasses
 import json
+import math
 import os
 import tomllib
 import types
@@ -225,7 +226,7 @@ class AdaptConfig:
     updates_per_step: float = 0.2
     """Gradient steps per environment step."""
     scenario: str = ""
-    """Target scenario; empty is the scenario of the data."""
+    """Target scenario; empty is the one that the agent was distilled in."""
     buffer_size: int = 100_000
     """Capacity of the replay buffer."""
     learning_starts: int = 500
@@ -355,7 +356,7 @@ def _resize(config: Config) -> Config:
         adapt=replace(
             config.adapt,
             steps=200 if tiny else 8_000,
-            learning_starts=50 if tiny else 500,
+            learning_starts=min(config.adapt.learning_starts, 50 if tiny else 500),
             evaluate_every=100 if tiny else 1_000,
         ),
         evaluate=replace(
@@ -421,6 +422,14 @@ def _checked(value: Any, hint: Any, path: str, source: str) -> Any:
     raise RapidError(f"Setting '{path}' in {source} must be {expected}, not {value!r}.")
 
 
+def _refuse_non_finite(values: dict[str, Any], where: str = "") -> None:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            _refuse_non_finite(value, f"{where}{key}.")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise RapidError(f"Setting '{where}{key}' is {value}, but must be a finite number.")
+
+
 def load_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a TOML file of settings.
 
@@ -441,6 +450,7 @@ def validate(config: Config) -> Config:
     Raises:
         RapidError: the first setting that does not, with what was expected.
     """
+    _refuse_non_finite(to_dict(config))
     get_scenario(config.scenario)
     if config.adapt.scenario:
         get_scenario(config.adapt.scenario)
@@ -472,7 +482,21 @@ def validate(config: Config) -> Config:
         (config.adapt.num_envs >= 1, "adapt.num_envs", config.adapt.num_envs, "at least 1"),
         (config.adapt.updates_per_step > 0, "adapt.updates_per_step", config.adapt.updates_per_step, "above 0"),
         (0 <= config.adapt.offline_share < 1, "adapt.offline_share", config.adapt.offline_share, "in [0, 1)"),
+        (network.width >= 1, "network.width", network.width, "at least 1"),
+        (network.feedforward >= 1, "network.feedforward", network.feedforward, "at least 1"),
+        (config.distill.iterations >= 1, "distill.iterations", config.distill.iterations, "at least 1"),
+        (config.distill.evaluate_every >= 0, "distill.evaluate_every", config.distill.evaluate_every, "at least 0"),
+        (config.adapt.steps >= 1, "adapt.steps", config.adapt.steps, "at least 1"),
+        (config.adapt.evaluate_every >= 0, "adapt.evaluate_every", config.adapt.evaluate_every, "at least 0"),
+        (config.adapt.buffer_size >= 1, "adapt.buffer_size", config.adapt.buffer_size, "at least 1"),
+        (config.adapt.learning_starts >= 0, "adapt.learning_starts", config.adapt.learning_starts, "at least 0"),
+        (config.teacher.concurrency >= 1, "teacher.concurrency", config.teacher.concurrency, "at least 1"),
+        (config.teacher.max_turns >= 1, "teacher.max_turns", config.teacher.max_turns, "at least 1"),
         (evaluate.spawns >= 1, "evaluate.spawns", evaluate.spawns, "at least 1"),
+        (evaluate.teacher_spawns >= 0, "evaluate.teacher_spawns", evaluate.teacher_spawns, "at least 0"),
+        (evaluate.planner_spawns >= 0, "evaluate.planner_spawns", evaluate.planner_spawns, "at least 0"),
+        (evaluate.curve_spawns >= 0, "evaluate.curve_spawns", evaluate.curve_spawns, "at least 0"),
+        (len(evaluate.attacks) >= 1, "evaluate.attacks", evaluate.attacks, "at least one name, such as none"),
     ]
     for name, phase in losses.items():
         loss, optimizer = phase.loss, phase.optimizer

@@ -44,6 +44,8 @@ def examine(teacher: TeacherConfig) -> Iterator[Finding]:
     for name, check in checks:
         try:
             yield check()
+        except RapidError as error:
+            yield Finding(name, "failed", str(error))
         except Exception as error:
             yield Finding(name, "failed", f"{type(error).__name__}: {error}", "Install again: make clean install.")
 

@@ -5,7 +5,7 @@ Every function here works on directories, so the verbs of the command line call 
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from rapid.attacks import get_attack
 from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict, validate
 from rapid.data.collection import Budget, collect, parse_shard
 from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
+from rapid.data.journal import exclusive
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
@@ -61,9 +62,15 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
         RapidError: anything about the input or the surroundings that keeps the run from its end.
     """
     check(config)
+    _check_whole(config)
     if restart and restart not in STEPS:
         raise RapidError(f"Unknown step '{restart}'{did_you_mean(restart, STEPS)} Steps: {', '.join(STEPS)}.")
     home = RunDirectory(directory, config, STEPS)
+    with exclusive(home.path / "lock"):
+        return _run_steps(config, home, restart, say)
+
+
+def _run_steps(config: Config, home: RunDirectory, restart: str, say: Callable[[str], None]) -> Path:
     if restart:
         home.restart_from(restart)
     actions: dict[str, Callable[[Config, RunDirectory], dict[str, Any]]] = {
@@ -75,7 +82,7 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
         "report": _report,
     }
     _warm_up(config, say)
-    say(f"run {directory}: {config.scenario}, recipe {config.recipe}, scale {config.scale}, seed {config.seed}")
+    say(f"run {home.path}: {config.scenario}, recipe {config.recipe}, scale {config.scale}, seed {config.seed}")
     for number, step in enumerate(STEPS, 1):
         heading = f"[{number}/{len(STEPS)}] {step}"
         if home.is_done(step):
@@ -84,7 +91,7 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
         say(heading)
         start = time.monotonic()
         facts = actions[step](config, home)
-        home.finish(step, time.monotonic() - start, **facts)
+        home.finish(step, time.monotonic() - start, commit=commit(), **facts)
     say("\n" + (home.path / "evaluate" / "summary.txt").read_text(encoding="utf-8"))
     times = ", ".join(f"{step} {format_seconds(home.facts(step)['seconds'])}" for step in STEPS)
     say(f"time: {times}")
@@ -131,11 +138,35 @@ def check(config: Config) -> None:
         models.is_present(config.teacher.model)
 
 
+def _check_whole(config: Config) -> None:
+    """Look for steps of one run that cannot follow each other."""
+    network, collected, mixture = config.network, config.collect, config.mix
+    if config.adapt.train == "adapter" and (network.kind not in ("rapid", "mlp-mixture") or network.num_policies < 2):
+        raise RapidError(
+            f"adapt.train is 'adapter', but a network of kind '{network.kind}' with {network.num_policies} policies "
+            "has no adapter. Choose network.kind 'rapid' with network.num-policies 2, or adapt.train 'all'."
+        )
+    for source, have, share in (
+        ("teacher", collected.teacher_transitions, mixture.p),
+        ("random", collected.random_transitions, 1 - mixture.p),
+    ):
+        if have < 1 or (mixture.level == "transition" and have < int(share * mixture.size)):
+            raise RapidError(
+                f"mix.size {mixture.size} at mix.p {mixture.p:g} needs {max(1, int(share * mixture.size))} {source} "
+                f"transitions, but collect.{source}_transitions is {have}. Collect more, or mix less."
+            )
+
+
 # Phase 1
 
 
 def _collect(config: Config, home: RunDirectory) -> dict[str, Any]:
     teacher_data = collect_transitions(config, home.path / "collect" / "teacher", "teacher")
+    if len(teacher_data) < config.collect.teacher_transitions:
+        raise RapidError(
+            f"The budget is spent after {len(teacher_data)} of {config.collect.teacher_transitions} transitions. What "
+            "was collected is kept, and the same command goes on collecting; or choose smaller sizes."
+        )
     random_data = collect_transitions(config, home.path / "collect" / "random", "random")
     return {"teacher_transitions": len(teacher_data), "random_transitions": len(random_data)}
 
@@ -156,6 +187,7 @@ def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher"
             source=source,
             shard=sizes.shard,
             budget=Budget(sizes.max_tokens, sizes.max_cost, sizes.max_seconds) if source == "teacher" else None,
+            make_worlds=lambda count: make_vec(config.scenario, count, simulator=config.simulator, autoreset=False),
             progress=work,
         )
 
@@ -183,7 +215,8 @@ def _distill(config: Config, home: RunDirectory) -> dict[str, Any]:
     # The two baselines that see the same data: what the method adds is the difference to them.
     plain = replace(config.distill.loss, conservative_weight=0.0, robust_weight=0.0, double=False)
     mlp = replace(config, network=replace(config.network, kind="mlp"))
-    dqn = replace(mlp, distill=replace(mlp.distill, loss=plain))
+    q_learning = replace(config.distill.optimizer, algorithm="dqn")
+    dqn = replace(mlp, distill=replace(mlp.distill, loss=plain, optimizer=q_learning))
     distill_agent(dqn, mixed, home.path / "distill" / "offline-dqn", "offline DQN")
     cloning = replace(mlp.distill, optimizer=replace(mlp.distill.optimizer, algorithm="bc"))
     distill_agent(replace(mlp, distill=cloning), mixed, home.path / "distill" / "cloning", "behaviour cloning")
@@ -235,11 +268,12 @@ def _adapt(config: Config, home: RunDirectory) -> dict[str, Any]:
 
 def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name: str = "RAPID") -> QAgent:
     """Let the agent in `agent` learn online in the target scenario; it is written to ``out/agent``."""
-    scenario = config.adapt.scenario or config.scenario
+    distilled = load_agent(agent, config.device)
+    scenario = config.adapt.scenario or distilled.metadata.get("scenario", config.scenario)
     settings = config.adapt if data else replace(config.adapt, offline_share=0.0)
     with task(f"adapt, {name}", settings.steps, "steps") as work:
         network = adapt(
-            load_agent(agent, config.device).network,
+            distilled.network,
             settings,
             scenario,
             out,
@@ -273,21 +307,24 @@ def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
 def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
     """Drive the agents named and write rows, table and plot to `out`; `teacher` is the configured teacher."""
     check(config)
-    for spec in specs:
-        _open(config, spec, config.scenario)
+    names = [str(_open(config, spec, config.scenario).name) for spec in specs]
+    # Two trainings of the same name would fall into one row of the table.
+    labels = {spec: f"{name} ({spec})" for spec, name in zip(specs, names, strict=True) if names.count(name) > 1}
+    files = [Path(spec) / "config.json" if Path(spec).is_dir() else Path(spec) for spec in specs]
     request = {
-        "agents": {spec: sha256(Path(spec) / "config.json") if Path(spec).is_dir() else "" for spec in specs},
+        "agents": [[spec, sha256(file) if file.is_file() else ""] for spec, file in zip(specs, files, strict=True)],
+        "teacher": to_dict(config.teacher) if TEACHER in specs else None,
         "scenario": config.scenario,
         "simulator": config.simulator,
         "seed": config.seed,
         "evaluate": to_dict(config.evaluate) | {"attacks": list(config.evaluate.attacks)},
     }
-    if out.exists() and any(out.iterdir()):
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
         if not (out / "request.json").exists() or read_json(out / "request.json") != request:
             raise RapidError(f"'{out}' holds something else than this comparison. Choose another --out, or empty it.")
     else:
         write_json(out / "request.json", request)
-    rows = _measure(config, config.scenario, specs, out)
+    rows = _measure(config, config.scenario, specs, out, labels)
     write_figures(ReportData(title=f"{config.scenario}", rows=rows), out)
     return rows
 
@@ -298,13 +335,21 @@ def _open(config: Config, spec: str, scenario: str) -> Any:
     return open_agent(spec, scenario, config.seed)
 
 
-def _measure(config: Config, scenario: str, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
-    """Drive every agent over the test spawns under every attack; an agent that is done is not driven again."""
+def _measure(
+    config: Config, scenario: str, specs: Sequence[str], out: Path, labels: Mapping[str, str] | None = None
+) -> list[EpisodeRow]:
+    """Drive every agent over the test spawns under every attack; an agent that is done is not driven again.
+
+    `labels` are names for agents whose own would not tell them apart.
+    """
     rows: list[EpisodeRow] = []
     for number, spec in enumerate(specs):
         part = out / "parts" / f"{number:02}.parquet"
         if not part.exists():
-            episodes = _drive(config, scenario, spec)
+            agent = _open(config, spec, scenario)
+            if labels and spec in labels:
+                agent.name = labels[spec]
+            episodes = _drive(config, scenario, spec, agent)
             if recordings := [recording for of in episodes for recording in of.recordings[:RECORDED]]:
                 save_recordings(part.with_suffix(".recordings.json"), recordings)
             source = commit()
@@ -317,8 +362,7 @@ def _measure(config: Config, scenario: str, specs: Sequence[str], out: Path) -> 
     return rows
 
 
-def _drive(config: Config, scenario: str, spec: str) -> list[Episodes]:
-    agent = _open(config, spec, scenario)
+def _drive(config: Config, scenario: str, spec: str, agent: Any) -> list[Episodes]:
     spawns, attacks = config.evaluate.spawns, config.evaluate.attacks
     if spec == TEACHER:
         # A language model takes long over a decision: fewer spawns, and only as it drives undisturbed.
@@ -379,7 +423,7 @@ def write_run_report(config: Config, directory: Path) -> Path:
         settings=to_dict(config),
         versions=manifest["versions"],
         commit=manifest["commit"],
-        command=f"rapid run --config {directory / 'config.toml'}",
+        command=f"rapid run --config {directory / 'config.toml'} --directory {directory}",
         started=manifest["started"],
         timings={step: read_json(path)["seconds"] for step, path in steps.items() if path.exists()},
         rows=load_rows(directory / "evaluate" / "episodes.parquet"),

@@ -83,7 +83,6 @@ class RunDirectory:
                 f"'{self.path}' exists and is not the directory of a run. Choose another --directory, or empty it."
             )
         else:
-            write_text(self.path / "config.toml", to_toml(to_dict(config)))
             write_json(
                 manifest,
                 {
@@ -95,9 +94,14 @@ class RunDirectory:
                     "started": datetime.now(UTC).isoformat(timespec="seconds"),
                 },
             )
+            write_text(self.path / "config.toml", to_toml(to_dict(config)))
 
     def _check_same(self, manifest: Any, config: Config) -> None:
-        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or "config" not in manifest:
+        if (
+            not isinstance(manifest, dict)
+            or manifest.get("format") != FORMAT
+            or not isinstance(manifest.get("config"), dict)
+        ):
             raise RapidError(
                 f"'{self.path / 'run.json'}' is not a run manifest of format {FORMAT}. It is damaged or was made by "
                 "another version; choose another --directory."
@@ -109,12 +113,13 @@ class RunDirectory:
             raise RapidError(
                 f"The run in '{self.path}' was made with other settings: {'; '.join(changes[:6])}"
                 f"{f'; and {len(changes) - 6} more' if len(changes) > 6 else ''}. Nothing was changed. Repeat its own "
-                f"settings (rapid run --config {self.path / 'config.toml'}), or choose another --directory."
+                f"settings (rapid run --config {self.path / 'config.toml'} --directory {self.path}), or choose another "
+                "--directory."
             )
 
     def is_done(self, step: str) -> bool:
-        """Whether `step` was finished."""
-        return self._mark(step).exists()
+        """Whether `step` and all before it were finished."""
+        return all(self._mark(before).exists() for before in self.steps[: self.steps.index(step) + 1])
 
     def finish(self, step: str, seconds: float, **facts: Any) -> None:
         """Mark `step` as done, with the time it took and facts about it."""
@@ -132,9 +137,13 @@ class RunDirectory:
         """
         if step not in self.steps:
             raise RapidError(f"Unknown step '{step}'{did_you_mean(step, self.steps)} Steps: {', '.join(self.steps)}.")
-        for later in self.steps[self.steps.index(step) :]:
-            self._mark(later).unlink(missing_ok=True)
-            shutil.rmtree(self.path / later, ignore_errors=True)
+        later = self.steps[self.steps.index(step) :]
+        # Marks first, the last one first: a kill in between leaves no step done whose input is gone.
+        for name in reversed(later):
+            self._mark(name).unlink(missing_ok=True)
+        for name in later:
+            if (self.path / name).exists():
+                shutil.rmtree(self.path / name)
 
     def _mark(self, step: str) -> Path:
         return self.path / "steps" / f"{step}.json"

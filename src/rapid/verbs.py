@@ -1,6 +1,8 @@
 """What each verb of the command line does. Options are fields of the settings tree (:mod:`rapid.config`)."""
 
 import dataclasses
+import hashlib
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -55,7 +57,7 @@ class Run:
     file: SettingsFile = ""
     """Settings in a TOML file; options override it, it overrides recipe and scale."""
     directory: str = ""
-    """Where the run lives; by default runs/SCENARIO-RECIPE-SCALE-seedN."""
+    """Where the run lives; by default runs/SCENARIO-RECIPE-SCALE-seedN, with a hash of other settings behind it."""
     restart: Annotated[str, arg(name="from", metavar="STEP")] = ""
     """Redo this step and all later ones: collect, mix, distill, adapt, evaluate or report."""
 
@@ -64,7 +66,8 @@ class Run:
 class Collect:
     """Let a teacher drive and keep every step as an offline dataset.
 
-    The same command goes on after an interruption.
+    The same command goes on after an interruption. With --teacher.backend scripted --teacher.model random it makes the
+    random data of a mixture, of --random-transitions transitions.
     """
 
     collect: Flat[CollectConfig] = field(default_factory=CollectConfig)
@@ -134,7 +137,8 @@ class Evaluate:
     """Compare agents over the same fixed spawns, clean and under attacks, in one table and one plot."""
 
     agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
-    """Directories of agents, ONNX files, and scripted drivers by name (slower, idle, faster, random, rule, planner)."""
+    """Directories of agents, ONNX files, and drivers by name: slower, idle, faster, random, rule, rule-forecast,
+    uniform-safe, planner, teacher (the one of --config)."""
     evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
     scenario: str = Config.scenario
     """Where they drive."""
@@ -216,8 +220,8 @@ def _base_settings(words: Sequence[str]) -> Config:
     chosen = {name: _option(words, name) for name in ("recipe", "scale", "config")}
     overrides = settings.load_toml(chosen["config"]) if chosen["config"] else {}
     source = f"'{chosen['config']}'"
-    recipe = chosen["recipe"] or overrides.get("recipe") or Config.recipe
-    scale = chosen["scale"] or overrides.get("scale") or Config.scale
+    recipe = chosen["recipe"] or str(overrides.get("recipe", Config.recipe))
+    scale = chosen["scale"] or str(overrides.get("scale", Config.scale))
     if words and ("-h" in words or "--help" in words):
         recipe, scale = (
             (recipe if recipe in settings.RECIPES else "strong"),
@@ -261,7 +265,8 @@ def _with_options(base: Config, options: Any) -> Config:
         return settings.validate(options.settings)
     names = {item.name for item in dataclasses.fields(options)} & {item.name for item in dataclasses.fields(Config)}
     config = dataclasses.replace(base, **{name: getattr(options, name) for name in names})
-    if curve_spawns := getattr(options, "curve_spawns", None):
+    curve_spawns = getattr(options, "curve_spawns", None)
+    if curve_spawns is not None:
         config = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, curve_spawns=curve_spawns))
     return settings.validate(config)
 
@@ -270,6 +275,13 @@ def _run(options: Run, config: Config) -> int:
     from rapid import pipeline
 
     name = f"{config.scenario}-{config.recipe}-{config.scale}-seed{config.seed}".replace(":", "-")
+    plain = dataclasses.replace(
+        settings.preset(config.recipe, config.scale), scenario=config.scenario, seed=config.seed, threads=config.threads
+    )
+    if config != plain:
+        # Any other setting gets a directory of its own, so that it does not meet the run without it.
+        differing = json.dumps(settings.to_dict(dataclasses.replace(config, threads=1)), sort_keys=True)
+        name += f"-{hashlib.sha256(differing.encode()).hexdigest()[:8]}"
     pipeline.run(config, Path(options.directory or f"runs/{name}"), options.restart)
     return 0
 
@@ -289,8 +301,10 @@ def _mix(options: Mix, config: Config) -> int:
     from rapid import pipeline
 
     out = Path(options.out)
-    if out.exists() and any(out.iterdir()):
-        raise RapidError(f"'{out}' exists and is not empty. Choose another --out, so that nothing is overwritten.")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise RapidError(
+            f"'{out}' exists and is not an empty directory. Choose another --out, so that nothing is overwritten."
+        )
     mixed = pipeline.mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
     print(f"{len(mixed)} transitions in {options.out}")
     return 0
@@ -299,6 +313,7 @@ def _mix(options: Mix, config: Config) -> int:
 def _distill(options: Distill, config: Config) -> int:
     from rapid import pipeline
 
+    pipeline.check(config)
     pipeline.distill_agent(config, Path(options.dataset), Path(options.out))
     print(f"The agent is in {options.out}/agent")
     return 0
@@ -307,6 +322,7 @@ def _distill(options: Distill, config: Config) -> int:
 def _adapt(options: Adapt, config: Config) -> int:
     from rapid import pipeline
 
+    pipeline.check(config)
     dataset = Path(options.dataset) if options.dataset else None
     pipeline.adapt_agent(config, Path(options.agent), dataset, Path(options.out))
     print(f"The agent is in {options.out}/agent")

@@ -138,7 +138,7 @@ def test_killed_by_the_system_it_ends_with_the_same_bytes(tmp_path, whole):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.002)
-    with pytest.raises(RapidError, match="Another process is collecting"):
+    with pytest.raises(RapidError, match="Another process is at work"):
         run(tmp_path)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()

@@ -127,7 +127,7 @@ def exclusive(path: Path) -> Generator[None, None, None]:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise RapidError(
-                f"Another process is collecting in '{path.parent}'. Wait for it, or give each its own directory and "
-                "`--shard i/n`."
+                f"Another process is at work in '{path.parent}'. Wait for it, or give each its own directory and, to "
+                "collect, `--shard i/n`."
             ) from error
         yield
