@@ -16,6 +16,7 @@ from rapid.training.worlds import epsilon_greedy
 
 SCENARIO = "lane-3-density-2"
 CONFIG = AdaptConfig(
+    offline_share=0.0,
     steps=60,
     num_envs=3,
     updates_per_step=0.5,
