@@ -9,7 +9,7 @@ import pytest
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.teacher.conversation import ChatError, ConversingTeacher, Reply, ToolCall
-from rapid.teacher.decision import to_record
+from rapid.teacher.decision import Decision, to_record
 from rapid.teacher.facts import gather, safest
 from rapid.teacher.replay import Replay
 from rapid.teacher.scene import read_scenes
@@ -24,7 +24,7 @@ class Script:
         self.lines, self.native_tools = list(lines), native_tools
         self.heard: list[list[dict]] = []
 
-    def ask(self, messages: Sequence[dict], tools: list[dict], schema: dict | None) -> Reply:
+    def ask(self, messages: Sequence[dict], tools: list[dict], schema: dict | None, logprobs: bool = False) -> Reply:
         self.heard.append(list(messages))
         line = self.lines.pop(0) if len(self.lines) > 1 else self.lines[0]
         if isinstance(line, Exception):
@@ -105,6 +105,21 @@ def test_a_dead_server_falls_back_then_stops(world):
         assert "gone" in decision.error
     with pytest.raises(RapidError, match="5 decisions in a row"):
         driver.decide(obs_BVF, [None])
+
+
+@pytest.mark.parametrize("style", ["digest", "react"])
+def test_the_last_decision_and_its_reason_are_told(world, style):
+    script = Script(Reply(KEEP))
+    before = Decision(4, explanation="the lead car brakes", status="ok")
+    teacher(script, style).decide(world(), [before])
+    assert "Your previous decision: slower. the lead car brakes" in script.heard[0][1]["content"]
+
+
+def test_a_word_alone_is_explained_by_what_was_told(world):
+    decision = decide(Script(Reply("keep", (), 100, 1)), world)
+    assert (decision.action, decision.status, decision.answer) == (1, "ok", "keep")
+    assert f"\nkeep: {decision.explanation}" in json.loads(decision.transcript)[0]["content"]
+    assert decision.probabilities is None
 
 
 def test_the_same_state_gives_the_same_prompt(world):

@@ -1,6 +1,7 @@
 """The endpoint against a server of ours on the loopback that plays every fault a real one has."""
 
 import json
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ import pytest
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher import make_teacher, to_record
+from rapid.teacher import from_record, make_teacher, to_record
 from rapid.teacher.conversation import ChatError, ConversingTeacher
 from rapid.teacher.endpoint import Endpoint
 
@@ -18,14 +19,19 @@ KEEP = '{"explanation": "calm road", "action": "keep"}'
 SECRET = "sk-planted-0123456789"
 
 
-def completion(text: str | None = KEEP, **message) -> dict:
+def completion(text: str | None = KEEP, logprobs: object = None, **message) -> dict:
     return {
         "id": "1",
         "object": "chat.completion",
         "created": 1,
         "model": "m",
         "choices": [
-            {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text, **message}}
+            {
+                "index": 0,
+                "finish_reason": "stop",
+                "message": {"role": "assistant", "content": text, **message},
+                "logprobs": logprobs,
+            }
         ],
         "usage": {"prompt_tokens": 11, "completion_tokens": 7, "total_tokens": 18},
     }
@@ -111,7 +117,7 @@ def decide(server, world, **changes):
 def test_a_good_answer(server, world):
     decision = decide(server, world)
     assert (decision.action, decision.status, decision.tokens_in, decision.tokens_out) == (1, "ok", 11, 7)
-    assert server.requests[0]["response_format"]["type"] == "json_schema"
+    assert (server.requests[0]["logprobs"], server.requests[0]["top_logprobs"]) == (True, 20)
     assert server.authorization == [f"Bearer {SECRET}"]
 
 
@@ -175,8 +181,74 @@ def test_what_a_server_refuses_is_left_out(server, world):
     decision = decide(server, world, style="react")
     assert decision.status == "ok"
     assert [set(request) & {"tools", "response_format"} for request in server.requests] == [{"tools"}, set()]
-    assert decide(server, world).status == "ok"
+    # After the tool turns the decision is asked for by a schema.
+    call = {"id": "c1", "type": "function", "function": {"name": "available_actions", "arguments": "{}"}}
+    server.acts = [answer(completion(None, tool_calls=[call])), act]
+    assert decide(server, world, style="react", max_turns=1).status == "ok"
+    assert "response_format" in server.requests[-2]
+    assert "response_format" not in server.requests[-1]
     assert decide(server, world, style="react", tool_calling="native").status == "fallback"
+
+
+def token(text: str, **alternatives: float) -> dict:
+    """A token as servers report it, with the probabilities of what might have stood there."""
+    others = [{"token": other, "logprob": math.log(share), "bytes": None} for other, share in alternatives.items()]
+    return {**max(others, key=lambda other: other["logprob"]), "token": text, "top_logprobs": others}
+
+
+def test_token_probabilities_become_the_soft_label(server, world):
+    spelled = {"keep": 0.4, " keep": 0.1, "Ke": 0.1, "slower": 0.2, "I": 0.1, "le": 0.1}
+    server.acts = [answer(completion("keep", {"content": [token("keep", **spelled)]}))]
+    decision = decide(server, world)
+    assert decision.probabilities == pytest.approx((1 / 9, 6 / 9, 0, 0, 2 / 9))
+    assert from_record(to_record(decision)) == decision
+    # On the leftmost lane there is no way to the left, whatever the model thinks of it.
+    config = settings(server)
+    leftmost = ConversingTeacher(Endpoint(config), config, {}, 3).decide(world(lane=0), [None])[0]
+    assert leftmost.probabilities == pytest.approx((0, 6 / 8, 0, 0, 2 / 8))
+
+
+def test_the_decision_is_found_inside_json(server, world):
+    parts = ["{", '"explanation": "I keep calm", ', '"action"', ': "', "slow", "er", '"}']
+    tokens = [token(part, **{part: 1.0}) for part in parts]
+    tokens[4] = token("slow", slow=0.75, keep=0.25)
+    server.acts = [answer(completion("".join(parts), {"content": tokens}))]
+    assert decide(server, world).probabilities == pytest.approx((0, 0.25, 0, 0, 0.75))
+
+
+@pytest.mark.parametrize(
+    "logprobs",
+    [
+        None,
+        [],
+        7,
+        {"content": None},
+        {"content": []},
+        {"content": [{}]},
+        {"content": [{"token": "keep"}]},
+        {"content": [{"token": "keep", "logprob": None, "top_logprobs": None}]},
+        {"content": [{"token": "keep", "logprob": "nan", "top_logprobs": []}]},
+        {"content": [{"token": "other", "logprob": -0.1, "top_logprobs": [{"token": "x", "logprob": -3}]}]},
+        {"content": [{"token": "keep", "logprob": -9999.0, "top_logprobs": []}]},
+    ],
+)
+def test_probabilities_that_make_no_sense_are_none(server, world, logprobs):
+    server.acts = [answer(completion("keep", logprobs))]
+    decision = decide(server, world)
+    assert (decision.action, decision.status, decision.probabilities) == (1, "ok", None)
+
+
+def test_a_server_without_token_probabilities_is_asked_once_for_them(server, world):
+    def act(handler, request) -> None:
+        refused = "logprobs" in request
+        (refuse(400, "logprobs are not supported") if refused else answer(completion("keep")))(handler, request)
+
+    server.acts = [act]
+    config = settings(server, concurrency=1)
+    driver = ConversingTeacher(Endpoint(config), config, {"model": "m"}, 3)
+    for _ in range(3):
+        assert driver.decide(world(), [None])[0].status == "ok"
+    assert ["logprobs" in request for request in server.requests] == [True, False, False, False]
 
 
 def test_native_tool_calls(server, world):
@@ -208,6 +280,36 @@ def test_the_key_is_found_nowhere(server, world, monkeypatch):
     with pytest.raises(ChatError) as caught:
         chat.ask([{"role": "user", "content": "?"}], [], None)
     assert not [text for text in [*said, repr(caught.value)] if SECRET in text]
+
+
+@pytest.mark.parametrize("key", ["sk-planted-0123456789", 'sk-"quoted"\\0123', "sk/with+signs=0123"])
+def test_an_answer_that_echoes_the_key_is_cleaned(server, world, monkeypatch, key):
+    monkeypatch.setenv("RAPID_TEST_KEY", key)
+    said = json.dumps({"explanation": f"your key {key} is worn out", "action": "keep"})
+    server.acts = [answer(completion(said))]
+    record = json.dumps(to_record(decide(server, world)))
+    for spelling in (key, json.dumps(key)[1:-1], json.dumps(json.dumps(key)[1:-1])[1:-1]):
+        assert spelling not in record
+    assert "your key [key] is worn out" in record
+
+
+def test_a_placeholder_for_a_key_changes_no_answer(server, world, monkeypatch):
+    monkeypatch.setenv("RAPID_TEST_KEY", "ee")
+    assert decide(server, world).status == "ok"
+
+
+@pytest.mark.parametrize(
+    "address", ["", "localhost:8000/v1", "ftp://host/v1", "http://", "http://[::1", "http://host:port/v1"]
+)
+def test_what_is_no_address_is_refused(address):
+    with pytest.raises(RapidError, match="cannot be used"):
+        Endpoint(TeacherConfig(backend="endpoint", base_url=address))
+
+
+def test_a_password_in_the_address_is_refused_and_not_repeated():
+    with pytest.raises(RapidError, match="holds a user name or password") as caught:
+        Endpoint(TeacherConfig(backend="endpoint", base_url=f"https://user:{SECRET}@host/v1"))
+    assert SECRET not in str(caught.value)
 
 
 def test_requests_run_side_by_side(server, crowd):

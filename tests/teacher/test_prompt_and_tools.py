@@ -97,7 +97,7 @@ def test_calls_in_plain_text():
 )
 def test_answers_are_found_wherever_they_stand(facts, form):
     answer = json.dumps({"explanation": "calm", "action": "keep"})
-    choice = read_choice(form.format(answer), facts)
+    choice = read_choice(form.format(answer), facts, "react")
     assert (choice.action, choice.explanation) == (IDLE, "calm")
 
 
@@ -105,11 +105,17 @@ def test_answers_are_found_wherever_they_stand(facts, form):
     "text", ["", "  ", "keep", '{"action": "keep"', '{"action": "hover"}', '{"action": null}', "[1]", "{" * 3000, "{}"]
 )
 def test_unusable_answers_have_a_fault(facts, text):
-    choice = read_choice(text, facts)
+    choice = read_choice(text, facts, "react")
     assert choice.action is None
     assert choice.fault
 
 
+@pytest.mark.parametrize("text", ["keep", " Keep.\n", "**keep**", "Let me see.\n\nkeep", '{"action": "keep"}'])
+def test_one_word_does_in_digest_style(facts, text):
+    assert read_choice(text, facts, "digest").action == IDLE
+    assert read_choice("keep or slower", facts, "digest").fault.startswith("The answer is neither")
+
+
 def test_impossible_actions_have_a_fault(world):
     facts = gather(read_scenes(world(lane=0), 3)[0])
-    assert "not possible" in read_choice('{"action": "left"}', facts).fault
+    assert "not possible" in read_choice('{"action": "left"}', facts, "react").fault

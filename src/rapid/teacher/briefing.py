@@ -26,7 +26,10 @@ DECISION_SCHEMA: dict[str, Any] = {
     "required": ["explanation", "action"],
     "additionalProperties": False,
 }
-_FORMAT = 'Give your decision as JSON and nothing else: {"explanation": "one sentence", "action": "ACTION"}'
+_FORMATS = {
+    "digest": "Answer with one word, the action, and nothing else.",
+    "react": 'Give your decision as JSON and nothing else: {"explanation": "one sentence", "action": "ACTION"}',
+}
 _CALL = re.compile(r"^\s*CALL\s+(\w+)\s*(\{.*\})?\s*$", re.MULTILINE)
 
 
@@ -57,7 +60,7 @@ def briefing(facts: Facts, previous: Decision | None, style: str, native_tools: 
                 'To use a tool, write one line and then stop:\nCALL tool_name {"argument": value}\nThe tools are:\n'
                 f"{tool_help()}\n"
             )
-    system += _FORMAT
+    system += _FORMATS[style]
     lines = [f"You are in lane {scene.lane + 1} of {scene.lanes} at {scene.speed:.1f} m/s."]
     lines += [describe_car(car) for car in scene.cars] or ["No other car is in sight."]
     if previous:
@@ -74,13 +77,16 @@ def read_call(text: str) -> tuple[str, str] | None:
     return (match[1], match[2] or "{}") if match else None
 
 
-def read_choice(text: str, facts: Facts) -> Choice:
-    """Read a final answer strictly: a JSON object with a known, possible action and an explanation."""
+def read_choice(text: str, facts: Facts, style: str) -> Choice:
+    """Read a final answer strictly: a JSON object (in `digest` style one word does) with a known, possible action."""
     if not text.strip():
         return Choice(None, fault="The answer was empty.")
-    answer = _last_object(text)
+    # Some think aloud first; a last line that is an action says what they mean.
+    word = text.strip().splitlines()[-1].strip(" .\"'`*")
+    answer = {"action": word} if style == "digest" and action_named(word) is not None else _last_object(text)
     if answer is None:
-        return Choice(None, fault="The answer holds no JSON object.")
+        fault = "is neither an action nor a JSON object" if style == "digest" else "holds no JSON object"
+        return Choice(None, fault=f"The answer {fault}.")
     action = action_named(answer.get("action"))
     if action is None:
         return Choice(None, fault=f"The action {json.dumps(answer.get('action'))[:80]} does not exist.")
@@ -90,9 +96,9 @@ def read_choice(text: str, facts: Facts) -> Choice:
     return Choice(action, explanation[:EXPLANATION_LIMIT] if isinstance(explanation, str) else "")
 
 
-def repair_request(fault: str, facts: Facts) -> str:
+def repair_request(fault: str, facts: Facts, style: str) -> str:
     """Return the message that asks once for a corrected answer."""
-    return f"{fault} Possible actions: {', '.join(WORDS[action] for action in facts.available)}. {_FORMAT}"
+    return f"{fault} Possible actions: {', '.join(WORDS[action] for action in facts.available)}. {_FORMATS[style]}"
 
 
 def _last_object(text: str) -> dict[str, Any] | None:

@@ -1,4 +1,8 @@
-"""A teacher that converses: digest or react, tools, one repair, and a counted fallback; whatever the server does."""
+"""A teacher that converses: digest or react, tools, one repair, and a counted fallback; whatever the server does.
+
+In `digest` style one word is asked for, so that the probabilities of the tokens at that place, where a server gives
+them, are a soft label. In `react` style the decision follows from what was said before it and is certain by then.
+"""
 
 import json
 import time
@@ -23,7 +27,8 @@ from rapid.teacher.briefing import (
 )
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import Facts, gather, safest
-from rapid.teacher.prompt import WORDS
+from rapid.teacher.logprobs import Token, action_probabilities
+from rapid.teacher.prompt import WORDS, outcome
 from rapid.teacher.scene import read_scenes
 from rapid.teacher.tools import call_tool, tool_specifications
 
@@ -59,6 +64,8 @@ class Reply:
     tokens_in: int = 0
     tokens_out: int = 0
     retries: int = 0
+    tokens: tuple[Token, ...] = ()
+    """The tokens of `text` with their probabilities, where they were asked for and given."""
 
 
 class Chat(Protocol):
@@ -69,8 +76,14 @@ class Chat(Protocol):
         """Whether tools are passed beside the messages; if not, the plain-text protocol is used."""
         ...
 
-    def ask(self, messages: Sequence[Message], tools: list[dict[str, Any]], schema: dict[str, Any] | None) -> Reply:
-        """Answer; `schema` is a wish that the caller checks itself.
+    def ask(
+        self,
+        messages: Sequence[Message],
+        tools: list[dict[str, Any]],
+        schema: dict[str, Any] | None,
+        logprobs: bool = False,
+    ) -> Reply:
+        """Answer; `schema` and `logprobs` are wishes: the caller checks the form, and does without probabilities.
 
         Raises:
             ChatError: no answer could be had this time.
@@ -88,13 +101,14 @@ class _Talk:
     tokens_out: int = 0
     retries: int = 0
     answer: str = ""
+    tokens: tuple[Token, ...] = ()
     faults: list[str] = field(default_factory=list[str])
 
     def note(self, reply: Reply) -> None:
         self.tokens_in += reply.tokens_in
         self.tokens_out += reply.tokens_out
         self.retries += reply.retries
-        self.answer = reply.text
+        self.answer, self.tokens = reply.text, reply.tokens
 
 
 class ConversingTeacher:
@@ -141,25 +155,31 @@ class ConversingTeacher:
         talk = _Talk([{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}])
         choice = Choice(None)
         try:
-            choice = read_choice(self._reason(talk, facts), facts)
+            choice = read_choice(self._reason(talk, facts), facts, self._config.style)
             if choice.action is None:
                 talk.faults.append(choice.fault)
-                choice = read_choice(self._repair(talk, facts), facts)
+                answer = self._correct(talk, facts, choice.fault)
+                choice = read_choice(answer, facts, self._config.style)
                 if choice.action is None:
                     talk.faults.append(choice.fault)
         except ChatError as error:
             talk.retries += error.retries
             talk.faults.append(f"no answer: {error}")
         status = "ok" if not talk.faults else "repaired"
-        action, explanation = choice.action, choice.explanation
+        action, probabilities = choice.action, None
         if action is None:
             action, status = safest(facts), "fallback"
             explanation = f"no usable answer; {WORDS[action]} leaves most room"
+        else:
+            # One word gives no reason: what was told about the action stands for it.
+            explanation = choice.explanation or outcome(facts, action)
+            probabilities = action_probabilities(talk.tokens, action, facts.available)
         cost = (talk.tokens_in * self._config.price_in + talk.tokens_out * self._config.price_out) / 1e6
         return Decision(
             action,
             explanation=explanation,
             answer=talk.answer[: 4 * EXPLANATION_LIMIT],
+            probabilities=probabilities,
             prompt_hash=prompt.hash,
             status=status,
             # The transport's error goes first: it says why there was no answer at all.
@@ -175,7 +195,7 @@ class ConversingTeacher:
     def _reason(self, talk: _Talk, facts: Facts) -> str:
         """Let the model call tools until it answers without a call, or its turns are used up."""
         if self._config.style == "digest":
-            return self._ask(talk, [], DECISION_SCHEMA).text
+            return self._conclude(talk)
         tools = tool_specifications()
         for _ in range(self._config.max_turns):
             reply = self._ask(talk, tools, None)
@@ -188,15 +208,21 @@ class ConversingTeacher:
                 talk.messages.append({"role": "user", "content": f"RESULT {call_tool(facts, *spoken)}"})
             else:
                 return reply.text
-        talk.messages.append({"role": "user", "content": repair_request("No more tool calls.", facts)})
-        return self._ask(talk, [], DECISION_SCHEMA).text
+        return self._correct(talk, facts, "No more tool calls.")
 
-    def _repair(self, talk: _Talk, facts: Facts) -> str:
-        talk.messages.append({"role": "user", "content": repair_request(talk.faults[-1], facts)})
-        return self._ask(talk, [], DECISION_SCHEMA).text
+    def _correct(self, talk: _Talk, facts: Facts, fault: str) -> str:
+        talk.messages.append({"role": "user", "content": repair_request(fault, facts, self._config.style)})
+        return self._conclude(talk)
 
-    def _ask(self, talk: _Talk, tools: list[dict[str, Any]], schema: dict[str, Any] | None) -> Reply:
-        reply = self._chat.ask(talk.messages, tools, schema)
+    def _conclude(self, talk: _Talk) -> str:
+        """Let the model decide without any more tools: with one word, or by the schema."""
+        one_word = self._config.style == "digest"
+        return self._ask(talk, [], None if one_word else DECISION_SCHEMA, one_word).text
+
+    def _ask(
+        self, talk: _Talk, tools: list[dict[str, Any]], schema: dict[str, Any] | None, logprobs: bool = False
+    ) -> Reply:
+        reply = self._chat.ask(talk.messages, tools, schema, logprobs)
         talk.note(reply)
         message: Message = {"role": "assistant", "content": reply.text}
         if reply.calls:

@@ -187,8 +187,14 @@ class LocalChat:
     def __init__(self, model: LocalModel, limit: int) -> None:
         self._model, self._limit = model, limit
 
-    def ask(self, messages: Sequence[Message], tools: list[dict[str, Any]], schema: dict[str, Any] | None) -> Reply:
-        """Answer a conversation; tools and schema are described in the messages already."""
+    def ask(
+        self,
+        messages: Sequence[Message],
+        tools: list[dict[str, Any]],
+        schema: dict[str, Any] | None,
+        logprobs: bool = False,
+    ) -> Reply:
+        """Answer a conversation; tools and schema are described in the messages already, probabilities not given."""
         text, tokens_in, tokens_out = self._model.write(messages, self._limit)
         return Reply(text, (), tokens_in, tokens_out)
 
