@@ -19,7 +19,7 @@ from rapid import files
 from rapid.errors import RapidError
 
 FORMAT = "rapid-state"
-VERSION = 1
+VERSION = 2
 
 State = dict[Any, Any]
 

@@ -71,8 +71,7 @@ def td_target(
 ) -> Tensor:
     """Return r + bootstrap * max_a Q_target(s', a) (B,); with `double`, `network` chooses a (paper: equation 2)."""
     next_q_BA = target_network(batch.next_obs_BVF)
-    chooser_BA = network(batch.next_obs_BVF) if double else next_q_BA
-    next_value_B = next_q_BA.gather(1, chooser_BA.argmax(1, keepdim=True)).squeeze(1)
+    next_value_B = _taken(next_q_BA, network(batch.next_obs_BVF).argmax(1)) if double else next_q_BA.amax(1)
     return batch.reward_B + batch.bootstrap_B * next_value_B
 
 

@@ -11,6 +11,7 @@ from rapid.data.batch import TransitionBatch
 from rapid.errors import RapidError
 from rapid.losses import behavior_cloning_loss, q_loss
 from rapid.networks.q_network import QNetwork
+from rapid.training.adam import Adam, clip_norm
 
 TERMS = ("td", "conservative", "robust", "total", "grad_norm")
 """What is recorded of every update; `grad_norm` is before clipping, and 0 where nothing is clipped."""
@@ -40,7 +41,7 @@ class Learner:
         self._targets: list[Tensor] = [
             targets[name] for name, parameter in network.named_parameters() if parameter.requires_grad
         ]
-        self._optimizer = torch.optim.Adam(self._trained, lr=config.learning_rate, fused=True)
+        self._adam = Adam(self._trained)
         self._terms: list[Tensor] = []
 
     @property
@@ -55,13 +56,12 @@ class Learner:
             loss = behavior_cloning_loss(self.network, batch, teacher_only=self.loss.robust_on == "teacher")
         else:
             loss = q_loss(self.network, self.target, batch, self.loss, self.generator)
-        self._optimizer.param_groups[0]["lr"] = self.learning_rate
-        self._optimizer.zero_grad()
-        loss.total.backward()
+        # A weight that this batch has no use for gets the gradient 0: the same as if it had been used in vain.
+        gradients = torch.autograd.grad(loss.total, self._trained, materialize_grads=True)
         norm = torch.zeros_like(loss.total)
         if self.config.max_grad_norm:
-            norm = torch.nn.utils.clip_grad_norm_(self._trained, self.config.max_grad_norm)
-        self._optimizer.step()
+            norm = clip_norm(gradients, self.config.max_grad_norm)
+        self._adam.step(gradients, self.learning_rate)
         self.updates += 1
         if self.updates % self.config.target_update == 0:
             self._update_target()
@@ -107,7 +107,7 @@ class Learner:
         return {
             "network": self.network.state_dict(),
             "target": self.target.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
+            "optimizer": self._adam.state_dict(),
             "generator": self.generator.get_state(),
             "updates": self.updates,
         }
@@ -116,6 +116,6 @@ class Learner:
         """Become as the learner was whose `state_dict` this is."""
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])
-        self._optimizer.load_state_dict(state["optimizer"])
+        self._adam.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
         self.updates = state["updates"]

@@ -1,0 +1,52 @@
+import copy
+
+import pytest
+import torch
+
+from rapid.training.adam import Adam, clip_norm
+
+
+def weights() -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return [torch.randn(shape, generator=generator, requires_grad=True) for shape in ((37, 5), (5,), ())]
+
+
+def gradients(step: int) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(step)
+    return [torch.randn(weight.shape, generator=generator) for weight in weights()]
+
+
+def test_steps_are_those_of_torch_bit_for_bit():
+    ours, theirs = weights(), weights()
+    adam, reference = Adam(ours), torch.optim.Adam(theirs, lr=1e-2, fused=True)
+    for step in range(1, 30):
+        rate = 1e-2 / step
+        adam.step(gradients(step), rate)
+        for weight, gradient in zip(theirs, gradients(step), strict=True):
+            weight.grad = gradient
+        reference.param_groups[0]["lr"] = rate
+        reference.step()
+        assert all(map(torch.equal, ours, theirs))
+
+
+@pytest.mark.parametrize("largest", [0.1, 100.0])
+def test_clipping_is_that_of_torch_bit_for_bit(largest):
+    ours, theirs = gradients(1), weights()
+    for weight, gradient in zip(theirs, gradients(1), strict=True):
+        weight.grad = gradient
+    assert torch.equal(clip_norm(ours, largest), torch.nn.utils.clip_grad_norm_(theirs, largest))
+    assert all(torch.equal(gradient, weight.grad) for gradient, weight in zip(ours, theirs, strict=True))
+
+
+def test_a_saved_optimiser_goes_on_as_the_original():
+    ours, theirs = weights(), weights()
+    adam, copied = Adam(ours), Adam(theirs)
+    for step in range(1, 5):
+        adam.step(gradients(step), 1e-2)
+    with torch.no_grad():
+        for weight, value in zip(theirs, ours, strict=True):
+            weight.copy_(value)
+    copied.load_state_dict(copy.deepcopy(adam.state_dict()))
+    for optimizer in (adam, copied):
+        optimizer.step(gradients(9), 1e-2)
+    assert all(map(torch.equal, ours, theirs))
