@@ -84,8 +84,18 @@ class CollectConfig:
     """Stop when the teacher has cost so much (see `price_in`); 0 is no limit."""
     max_seconds: float = 0.0
     """Stop after so many seconds of collecting; 0 is no limit."""
+    max_decisions: int = 0
+    """Stop before the teacher has made more decisions than this; 0 is no limit."""
     shard: str = "1/1"
-    """Which part of the episodes this process collects, as `i/n`."""
+    """Which part of the episodes this process collects, as `i/n`; for processes that you start yourself."""
+    engine: Literal["local", "ray"] = "local"
+    """Where workers run: on this machine, or on a Ray cluster (RAY_ADDRESS; every machine needs the same RAPID, and the
+    API key, if any, in the environment that its `ray start` was given)."""
+    workers: int = 1
+    """Parts of the collection that are under way at once, each with a teacher of its own."""
+    shards: int = 0
+    """Into how many parts the collection is divided, which decides what is collected; 0 is one for each worker, or as
+    many as the directory was begun with."""
 
 
 @dataclass(frozen=True)
@@ -369,6 +379,11 @@ def _resize(config: Config) -> Config:
     )
 
 
+def without_place(config: Config) -> Config:
+    """Return `config` with the settings at their defaults that say where and how fast it is computed, not what."""
+    return replace(config, threads=1, collect=replace(config.collect, engine="local", workers=1))
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a dataclass as plain dictionaries and lists, ready for JSON or TOML."""
     return dataclasses.asdict(config)
@@ -462,6 +477,21 @@ def validate(config: Config) -> Config:
         (collect.teacher_transitions >= 0, "collect.teacher_transitions", collect.teacher_transitions, "at least 0"),
         (collect.random_transitions >= 0, "collect.random_transitions", collect.random_transitions, "at least 0"),
         (collect.lockstep >= 1, "collect.lockstep", collect.lockstep, "at least 1"),
+        (collect.max_decisions >= 0, "collect.max_decisions", collect.max_decisions, "at least 0"),
+        (1 <= collect.workers <= 1000, "collect.workers", collect.workers, "between 1 and 1000"),
+        (0 <= collect.shards <= 1000, "collect.shards", collect.shards, "between 0 and 1000"),
+        (
+            collect.shard == "1/1" or max(collect.workers, collect.shards) == 1,
+            "collect.shard",
+            collect.shard,
+            "1/1 where collect.workers or collect.shards divide the collection",
+        ),
+        (
+            collect.engine == "local" or max(collect.workers, collect.shards) > 1,
+            "collect.workers",
+            collect.workers,
+            f"at least 2 for the engine '{collect.engine}'",
+        ),
         (0 <= config.mix.p <= 1, "mix.p", config.mix.p, "between 0 and 1"),
         (config.mix.size >= 1, "mix.size", config.mix.size, "at least 1"),
         (network.num_policies >= 1, "network.num_policies", network.num_policies, "at least 1"),

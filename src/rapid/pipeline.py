@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict
 from rapid.data.collection import Budget, collect, parse_shard
 from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
 from rapid.data.journal import exclusive
+from rapid.data.sharding import collect_shards, shards_of
+from rapid.engines import check_engine
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
@@ -33,7 +36,7 @@ from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
 from rapid.simulator import make_vec
 from rapid.spawns import TrainPart, spawn_seeds
-from rapid.teacher import make_teacher, models
+from rapid.teacher import Teacher, make_teacher, models
 from rapid.training.offline import distill
 from rapid.training.online import adapt
 from rapid.training.record import load_metrics
@@ -132,6 +135,7 @@ def check(config: Config) -> None:
     for name in config.evaluate.attacks:
         get_attack(name, lanes)
     parse_shard(config.collect.shard)
+    check_engine(config.collect.engine)
     if config.teacher.backend == "scripted":
         make_teacher(config.teacher, lanes)
     elif config.teacher.backend == "local":
@@ -167,7 +171,9 @@ def _collect(config: Config, home: RunDirectory) -> dict[str, Any]:
             f"The budget is spent after {len(teacher_data)} of {config.collect.teacher_transitions} transitions. What "
             "was collected is kept, and the same command goes on collecting; or choose smaller sizes."
         )
-    random_data = collect_transitions(config, home.path / "collect" / "random", "random")
+    # The random driver takes seconds: dividing its work would cost more than it gains.
+    alone = replace(config, collect=replace(config.collect, engine="local", workers=1, shards=1))
+    random_data = collect_transitions(alone, home.path / "collect" / "random", "random")
     return {"teacher_transitions": len(teacher_data), "random_transitions": len(random_data)}
 
 
@@ -176,20 +182,50 @@ def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher"
     settings = config.teacher if source == "teacher" else TeacherConfig(backend="scripted", model="random")
     sizes = config.collect
     wanted = sizes.teacher_transitions if source == "teacher" else sizes.random_transitions
-    teacher = make_teacher(settings, get_scenario(config.scenario).lanes, config.seed)
-    with task(f"collect, {teacher.name}", wanted, "transitions") as work:
-        return collect(
-            teacher,
+    budget = Budget(sizes.max_tokens, sizes.max_cost, sizes.max_seconds, sizes.max_decisions)
+    options: dict[str, Any] = {
+        "source": source,
+        "budget": budget if source == "teacher" else None,
+        "make_worlds": partial(make_vec, config.scenario, simulator=config.simulator, autoreset=False),
+    }
+    lockstep = sizes.lockstep if source == "teacher" else max(sizes.lockstep, 100)
+    have = shards_of(out)
+    shards = sizes.shards or have or sizes.workers
+    if shards == 1 and sizes.workers > 1:
+        raise RapidError(
+            f"The collection in '{out}' was begun in one part, which one worker drives. Go on with --workers 1 and "
+            "--engine local, or choose another directory."
+        )
+    if shards == 1:
+        teacher = make_teacher(settings, get_scenario(config.scenario).lanes, config.seed)
+        with task(f"collect, {teacher.name}", wanted, "transitions") as work:
+            return collect(teacher, config.scenario, out, wanted, lockstep, shard=sizes.shard, progress=work, **options)
+    # Each worker has a teacher of its own; together they ask no more than one would.
+    at_once = min(sizes.workers, shards)
+    settings = replace(
+        settings,
+        concurrency=max(1, settings.concurrency // at_once),
+        requests_per_minute=settings.requests_per_minute / at_once,
+    )
+    title = f"collect, {settings.model}, {shards} shards"
+    with task(title, wanted, "transitions") as work:
+        return collect_shards(
+            partial(_worker_teacher, settings, get_scenario(config.scenario).lanes, config.seed, config.threads),
             config.scenario,
             out,
             wanted,
-            sizes.lockstep if source == "teacher" else max(sizes.lockstep, 100),
-            source=source,
-            shard=sizes.shard,
-            budget=Budget(sizes.max_tokens, sizes.max_cost, sizes.max_seconds) if source == "teacher" else None,
-            make_worlds=lambda count: make_vec(config.scenario, count, simulator=config.simulator, autoreset=False),
+            lockstep,
+            shards=shards,
+            workers=sizes.workers,
+            engine=sizes.engine,
             progress=work,
+            **options,
         )
+
+
+def _worker_teacher(settings: TeacherConfig, lanes: int, seed: int, threads: int) -> Teacher:
+    torch.set_num_threads(threads)
+    return make_teacher(settings, lanes, seed)
 
 
 def _mix(config: Config, home: RunDirectory) -> dict[str, Any]:

@@ -12,13 +12,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import rapid
-from rapid.config import Config, to_dict, to_toml
+from rapid.config import Config, apply_overrides, preset, to_dict, to_toml, without_place
 from rapid.errors import RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
 
@@ -106,9 +105,11 @@ class RunDirectory:
                 f"'{self.path / 'run.json'}' is not a run manifest of format {FORMAT}. It is damaged or was made by "
                 "another version; choose another --directory."
             )
-        # The number of threads decides how fast, not what; a run may go on with another.
-        now = to_dict(replace(config, threads=1))
-        changes = _differences({**manifest["config"], "threads": 1}, now)
+        made = manifest["config"]
+        # A setting that did not exist when the run was made had the effect that its default has now.
+        base = preset(made.get("recipe", config.recipe), made.get("scale", config.scale))
+        there = apply_overrides(base, made, source=f"'{self.path / 'run.json'}'")
+        changes = _differences(to_dict(without_place(there)), to_dict(without_place(config)))
         if changes:
             raise RapidError(
                 f"The run in '{self.path}' was made with other settings: {'; '.join(changes[:6])}"

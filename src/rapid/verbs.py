@@ -66,8 +66,9 @@ class Run:
 class Collect:
     """Let a teacher drive and keep every step as an offline dataset.
 
-    The same command goes on after an interruption. With --teacher.backend scripted --teacher.model random it makes the
-    random data of a mixture, of --random-transitions transitions.
+    The same command goes on after an interruption, and with a larger budget or more transitions. --workers n divides
+    the work among n processes, or with --engine ray among the machines of a Ray cluster. With --teacher.backend
+    scripted --teacher.model random it makes the random data of a mixture, of --random-transitions transitions.
     """
 
     collect: Flat[CollectConfig] = field(default_factory=CollectConfig)
@@ -276,11 +277,11 @@ def _run(options: Run, config: Config) -> int:
 
     name = f"{config.scenario}-{config.recipe}-{config.scale}-seed{config.seed}".replace(":", "-")
     plain = dataclasses.replace(
-        settings.preset(config.recipe, config.scale), scenario=config.scenario, seed=config.seed, threads=config.threads
+        settings.preset(config.recipe, config.scale), scenario=config.scenario, seed=config.seed
     )
-    if config != plain:
+    if settings.without_place(config) != settings.without_place(plain):
         # Any other setting gets a directory of its own, so that it does not meet the run without it.
-        differing = json.dumps(settings.to_dict(dataclasses.replace(config, threads=1)), sort_keys=True)
+        differing = json.dumps(settings.to_dict(settings.without_place(config)), sort_keys=True)
         name += f"-{hashlib.sha256(differing.encode()).hexdigest()[:8]}"
     pipeline.run(config, Path(options.directory or f"runs/{name}"), options.restart)
     return 0

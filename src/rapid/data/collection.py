@@ -9,12 +9,12 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rapid.data.dataset import DATASET_FILE, Dataset, load_dataset, save_dataset
-from rapid.data.driving import Budget, Collecting, MakeWorlds
+from rapid.data.driving import Budget, Collecting, MakeWorlds, SpentError, Tally
 from rapid.data.journal import exclusive
 from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
 from rapid.errors import RapidError
@@ -37,6 +37,11 @@ def parse_shard(shard: str) -> tuple[int, int]:
     raise RapidError(f"Shard '{shard}' is not of the form i/n with 1 <= i <= n. For the second of four, write 2/4.")
 
 
+def identity(teacher: Teacher) -> dict[str, Any]:
+    """Return who drives, as it will be read back from JSON: a comparison then sees no tuples."""
+    return json.loads(json.dumps({"name": teacher.name, **teacher.describe()}))
+
+
 def collect(
     teacher: Teacher,
     scenario: str,
@@ -50,6 +55,7 @@ def collect(
     budget: Budget | None = None,
     make_worlds: MakeWorlds | None = None,
     progress: Task | None = None,
+    watch: Callable[[Tally], None] | None = None,
 ) -> Dataset:
     """Collect whole episodes until there are at least `transitions`, or go on with what the directory holds.
 
@@ -66,8 +72,10 @@ def collect(
         make_worlds: gives a vector environment of so many worlds in which a finished world waits; None is
             `rapid.make_vec(scenario, n, autoreset=False)`.
         progress: counts transitions; its note shows decisions/s, cost and the share of fallbacks.
+        watch: is called after every step with how far it is.
 
     Raises:
+        SpentError: the budget did not suffice for a single group of episodes.
         RapidError: the directory holds something else, is in use or damaged, the seeds or the budget do not suffice.
     """
     root = Path(directory)
@@ -76,8 +84,7 @@ def collect(
     settings = {
         "scenario": get_scenario(scenario).name,
         "source": source,
-        # As it will be read back, so that the comparison sees no tuples.
-        "driver": json.loads(json.dumps({"name": teacher.name, **teacher.describe()})),
+        "driver": identity(teacher),
         "seeds": {"first": seeds[0] if len(seeds) else None, "count": len(seeds)},
         "shard": shard,
     }
@@ -98,11 +105,11 @@ def collect(
             _reopen(dataset, work)
             write_json(work / "settings.json", settings)
             (root / DATASET_FILE).unlink()
-        run = Collecting(teacher, settings, work, budget or Budget(), progress)
+        run = Collecting(teacher, settings, work, budget or Budget(), progress, watch)
         spent = run.collect_until(target, lockstep, seeds, make_worlds or _default_worlds(scenario))
         dataset = run.dataset(complete=not spent)
         if not len(dataset):
-            raise RapidError(
+            raise SpentError(
                 f"{spent} before the first group of episodes was finished. Every decision is kept: raise the budget "
                 "and run the same command again, or collect fewer episodes side by side."
             )

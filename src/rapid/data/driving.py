@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -34,7 +34,7 @@ MakeWorlds = Callable[[int], Any]
 
 @dataclass(frozen=True)
 class Budget:
-    """When to stop early; 0 is no limit. Tokens and cost count over all runs of a collection, seconds over this one."""
+    """When to stop early; 0 is no limit. All but seconds count over all runs of a collection, seconds over this one."""
 
     tokens: int = 0
     """Tokens read and written."""
@@ -42,9 +42,30 @@ class Budget:
     """Price, in the currency of the settings."""
     seconds: float = 0.0
     """Wall-clock seconds of this process."""
+    decisions: int = 0
+    """Decisions; never exceeded, while the others are noticed once they are."""
 
 
-class SpentError(Exception):
+class Tally(NamedTuple):
+    """How far a collection is, sent after every step."""
+
+    decisions: int = 0
+    """Decisions so far, those of earlier runs included."""
+    fresh: int = 0
+    """Decisions that the teacher was asked for in this run."""
+    rate: float = 0.0
+    """Fresh decisions per second."""
+    cost: float = 0.0
+    fallbacks: int = 0
+
+    def note(self, source: int) -> str:
+        """Return what is shown beside the count; chance gives no invalid answers."""
+        cost = f", cost {self.cost:.4g}" if self.cost else ""
+        invalid = f", {self.fallbacks / max(self.decisions, 1):.1%} fallbacks" if source == TEACHER else ""
+        return f"{self.rate:.3g} decisions/s{cost}{invalid}"
+
+
+class SpentError(RapidError):
     """The budget is spent; the message says which."""
 
 
@@ -52,9 +73,16 @@ class Collecting:
     """One process's share of a collection: the finished parts and what they add up to."""
 
     def __init__(
-        self, teacher: Teacher, settings: dict[str, Any], work: Path, budget: Budget, progress: Task | None
+        self,
+        teacher: Teacher,
+        settings: dict[str, Any],
+        work: Path,
+        budget: Budget,
+        progress: Task | None,
+        watch: Callable[[Tally], None] | None = None,
     ) -> None:
         self.teacher, self.settings, self.work, self.budget, self.progress = teacher, settings, work, budget, progress
+        self.watch = watch
         self.source = SOURCES.index(settings["source"])
         self.parts = [read_parquet(path, "part of a collection") for path in sorted(work.glob("part-*.parquet"))]
         self.count = sum(part.num_rows for part in self.parts)
@@ -75,8 +103,13 @@ class Collecting:
             while self.count < target:
                 journal = Journal(self.work / "journal.jsonl", len(self.parts))
                 try:
-                    # The last groups are smaller, so that little more than the target is collected.
+                    # The last groups are smaller, so that little more than the target is collected, and no group is
+                    # begun that the decisions left would not finish.
                     wanted = min(lockstep, math.ceil((target - self.count) / duration))
+                    if self.budget.decisions and journal.seeds is None:
+                        wanted = min(wanted, (self.budget.decisions - self.decisions) // duration)
+                        if wanted < 1:
+                            raise SpentError(f"The budget of {self.budget.decisions} decisions was spent")
                     group = journal.seeds or list(seeds[self.episodes : self.episodes + wanted])
                     if not group:
                         raise RapidError(
@@ -116,7 +149,7 @@ class Collecting:
             seen = np.array(obs_BVF[active], np.float32)
             decisions = journal.recall(seen)
             if decisions is None:
-                self._check_budget()
+                self._check_budget(len(active))
                 keys = np.array([stream_seed(seeds[world], f"step/{step}") for world in active], np.int64)
                 decisions = self.teacher.decide(seen, [previous[world] for world in active], keys)
                 journal.append(seen, decisions)
@@ -191,8 +224,11 @@ class Collecting:
         self.cost += sum(decision.cost for decision in decisions)
         self.fallbacks += sum(decision.status == "fallback" for decision in decisions)
 
-    def _check_budget(self) -> None:
+    def _check_budget(self, coming: int) -> None:
+        """Raise if the budget is spent, or does not allow for the decisions that come next."""
         budget, seconds = self.budget, time.monotonic() - self.start
+        if budget.decisions and self.decisions + coming > budget.decisions:
+            raise SpentError(f"The budget of {budget.decisions} decisions was spent")
         for name, used, limit in (
             ("tokens", self.tokens, budget.tokens),
             ("cost", self.cost, budget.cost),
@@ -202,10 +238,10 @@ class Collecting:
                 raise SpentError(f"The budget of {limit:g} {name} was spent")
 
     def _show(self, count: int) -> None:
-        if self.progress is None:
-            return
         rate = self.fresh / max(time.monotonic() - self.start, 1e-9)
-        cost = f", cost {self.cost:.4g}" if self.cost else ""
-        invalid = f", {self.fallbacks / self.decisions:.1%} fallbacks" if self.source == TEACHER else ""
-        self.progress.note(f"{rate:.3g} decisions/s{cost}{invalid}")
-        self.progress.advance(count)
+        tally = Tally(self.decisions, self.fresh, rate, self.cost, self.fallbacks)
+        if self.watch:
+            self.watch(tally)
+        if self.progress:
+            self.progress.note(tally.note(self.source))
+            self.progress.advance(count)

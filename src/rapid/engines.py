@@ -1,0 +1,231 @@
+"""Where independent pieces of work run: in this process, in processes beside it, or on a Ray cluster.
+
+A job is a function of one argument and of `report`, which sends anything back while the job is under way; all three
+must be picklable. What a job returns does not depend on where it ran.
+"""
+
+import importlib
+import multiprocessing
+import os
+import signal
+import traceback
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from typing import Any, Literal, TypeVar, get_args
+
+import rapid
+from rapid.errors import RapidError, did_you_mean
+
+Engine = Literal["local", "ray"]
+"""`local`: this machine. `ray`: the cluster that the environment variable RAY_ADDRESS names or that runs here, else a
+Ray of one's own on this machine."""
+
+Report = Callable[[Any], None]
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+
+_POLL = 0.5
+"""Seconds between two looks at what Ray's tasks have reported."""
+_PATIENCE = 5.0
+"""Seconds that a process has to end when it is told to."""
+_RETRIES = 3
+"""Times that Ray starts a task again whose process or machine was lost."""
+
+
+def run_jobs(
+    function: Callable[[Argument, Report], Result],
+    arguments: Sequence[Argument],
+    engine: Engine = "local",
+    workers: int = 1,
+    receive: Callable[[int, Any], None] | None = None,
+) -> Generator[tuple[int, Result], None, None]:
+    """Run one job for each argument, at most `workers` at once, and yield (index, result) as they end.
+
+    The first job that fails ends them all, as does closing the generator; jobs must be able to bear that. One local
+    worker is this process.
+
+    Args:
+        function: the job, found by its name in a module.
+        arguments: one for each job.
+        engine: where they run.
+        workers: how many run at once.
+        receive: is called with (index, report) in this process.
+
+    Raises:
+        RapidError: what a job raised, a job's process that was lost, or an engine that cannot be had.
+    """
+    check_engine(engine)
+    hear = receive or (lambda index, report: None)
+    if engine == "ray":
+        yield from _on_ray(function, arguments, workers, hear)
+    elif workers == 1:
+        for index, argument in enumerate(arguments):
+            yield index, function(argument, partial(hear, index))
+    else:
+        yield from _in_processes(function, arguments, workers, hear)
+
+
+def check_engine(engine: str) -> None:
+    """Look whether an engine can be had.
+
+    Raises:
+        RapidError: it does not exist, or is not installed.
+    """
+    if engine not in get_args(Engine):
+        raise RapidError(
+            f"Unknown engine '{engine}'{did_you_mean(engine, get_args(Engine))} "
+            f"Choose one of {', '.join(get_args(Engine))}."
+        )
+    if engine == "ray":
+        _need_ray()
+
+
+def _in_processes(
+    function: Callable[[Argument, Report], Result],
+    arguments: Sequence[Argument],
+    workers: int,
+    receive: Callable[[int, Any], None],
+) -> Generator[tuple[int, Result], None, None]:
+    # Not an executor of the standard library: those cannot be told to end their processes.
+    context = multiprocessing.get_context("spawn")
+    waiting = deque(enumerate(arguments))
+    running: dict[Connection, tuple[int, Any]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                index, argument = waiting.popleft()
+                ours, theirs = context.Pipe(duplex=False)
+                process = context.Process(target=_serve, args=(theirs, function, argument), daemon=True)
+                process.start()
+                # Only the process holds the other end, so that its death shows as the end of the pipe.
+                theirs.close()
+                running[ours] = index, process
+            for connection in wait(list(running)):
+                assert isinstance(connection, Connection)
+                index, process = running[connection]
+                try:
+                    kind, value = connection.recv()
+                except EOFError:
+                    process.join(_PATIENCE)
+                    raise RapidError(
+                        f"The process of job {index + 1} of {len(arguments)} was ended from outside (exit code "
+                        f"{process.exitcode}); too little memory is the usual cause. What is done is kept: run the "
+                        "same command again, perhaps with fewer workers."
+                    ) from None
+                if kind == "report":
+                    receive(index, value)
+                    continue
+                del running[connection]
+                connection.close()
+                process.join(_PATIENCE)
+                yield index, _unpack(kind, value)
+    finally:
+        for connection, (_, process) in running.items():
+            process.terminate()
+            connection.close()
+        for _, process in running.values():
+            process.join(_PATIENCE)
+
+
+def _serve(connection: Connection, function: Callable[[Any, Report], Any], argument: Any) -> None:
+    """Do one job in a process of its own; it ends with the parent, which it notices when it next reports."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+
+    def send(message: tuple[str, Any]) -> None:
+        try:
+            connection.send(message)
+        except OSError:  # nobody listens any more
+            raise SystemExit(1) from None
+
+    send(_attempt(rapid.__version__, function, argument, lambda value: send(("report", value))))
+
+
+def _attempt(version: str, function: Callable[[Any, Report], Any], argument: Any, report: Report) -> tuple[str, Any]:
+    """Do a job and return ("result", value) or why there is none: as ("refusal", message) or ("fault", traceback)."""
+    if version != rapid.__version__:
+        return "refusal", (
+            f"This worker has version {rapid.__version__} of RAPID, the command {version}. Install the same version on "
+            "every machine."
+        )
+    try:
+        return "result", function(argument, report)
+    except RapidError as error:
+        return "refusal", str(error)
+    except Exception:
+        return "fault", traceback.format_exc()
+
+
+def _unpack(kind: str, value: Any) -> Any:
+    if kind == "refusal":
+        raise RapidError(value)
+    if kind == "fault":
+        raise RuntimeError(f"A worker failed:\n{value}")
+    return value
+
+
+def _need_ray() -> Any:
+    try:
+        ray = importlib.import_module("ray")
+        for part in ("ray.exceptions", "ray.util.queue"):
+            importlib.import_module(part)
+    except ImportError as error:
+        raise RapidError(
+            "The engine 'ray' needs the package 'ray', which is not installed. Install it on every machine with: "
+            "pip install 'rapid-driving[ray]'; or use --engine local."
+        ) from error
+    return ray
+
+
+def _on_ray(
+    function: Callable[[Argument, Report], Result],
+    arguments: Sequence[Argument],
+    workers: int,
+    receive: Callable[[int, Any], None],
+) -> Generator[tuple[int, Result], None, None]:
+    ray = _need_ray()
+    started = not ray.is_initialized()
+    if started:
+        # A Ray of our own sends nothing home unless the user says so.
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        try:
+            ray.init(include_dashboard=False, log_to_driver=False, logging_level="error")
+        except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+            raise RapidError(
+                f"Ray cannot be reached or started: {error} Check RAY_ADDRESS and `ray status`, or use --engine local."
+            ) from error
+    # Named by their place in the list: what is kept of a task after it ended is no more than its result.
+    waiting = deque(enumerate(arguments))
+    running: dict[Any, int] = {}
+    reports: Any = None
+    try:
+        reports = ray.util.queue.Queue(actor_options={"num_cpus": 0})
+        attempt = ray.remote(num_cpus=1, max_retries=_RETRIES)(_attempt)
+        while waiting or running:
+            while waiting and len(running) < workers:
+                index, argument = waiting.popleft()
+                report = partial(_put, reports, index)
+                running[attempt.remote(rapid.__version__, function, argument, report)] = index
+            ended, _ = ray.wait(list(running), num_returns=1, timeout=_POLL)
+            for index, report in reports.get_nowait_batch(reports.qsize()):
+                receive(index, report)
+            for task in ended:
+                yield running.pop(task), _unpack(*ray.get(task))
+    except ray.exceptions.RayError as error:
+        last = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+        raise RapidError(
+            f"Ray lost a job: {type(error).__name__}: {last[0]} Every machine needs the same RAPID and enough memory. "
+            "What is done is kept: run the same command again."
+        ) from error
+    finally:
+        for task in running:
+            ray.cancel(task, force=True)
+        if reports is not None:
+            reports.shutdown(force=True)
+        if started:
+            ray.shutdown()
+
+
+def _put(reports: Any, index: int, report: Any) -> None:
+    reports.put_nowait((index, report))

@@ -1,0 +1,74 @@
+import os
+import signal
+import sys
+import time
+
+import pytest
+
+from rapid import engines
+from rapid.engines import run_jobs
+from rapid.errors import RapidError
+
+
+def job(argument: int, report: engines.Report) -> tuple[int, int]:
+    """Report, then square; some arguments go wrong."""
+    report(("begun", argument))
+    if argument == -1:
+        raise RapidError("no such thing")
+    if argument == -2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if argument == -3:
+        time.sleep(600)
+    if argument == -4:
+        raise KeyError("slip")
+    return argument**2, os.getpid()
+
+
+def run(arguments: list[int], **options) -> tuple[dict[int, int], list, set[int]]:
+    heard: list = []
+    results = dict(run_jobs(job, arguments, receive=lambda index, value: heard.append((index, value)), **options))
+    return {index: value for index, (value, _) in results.items()}, heard, {pid for _, pid in results.values()}
+
+
+def test_one_worker_is_this_process():
+    results, heard, pids = run([3, 4])
+    assert results == {0: 9, 1: 16}
+    assert heard == [(0, ("begun", 3)), (1, ("begun", 4))]
+    assert pids == {os.getpid()}
+
+
+def test_processes_do_the_same():
+    results, heard, pids = run([1, 2, 3], workers=2)
+    assert results == {0: 1, 1: 4, 2: 9}
+    assert sorted(heard) == [(0, ("begun", 1)), (1, ("begun", 2)), (2, ("begun", 3))]
+    assert len(pids) == 3
+    assert os.getpid() not in pids
+
+
+@pytest.mark.parametrize(
+    ("argument", "error", "says"),
+    [
+        (-1, RapidError, "no such thing"),
+        (-2, RapidError, "ended from outside .exit code -9"),
+        (-4, RuntimeError, "slip"),
+    ],
+)
+def test_the_first_failure_ends_the_others(argument, error, says):
+    start = time.monotonic()
+    with pytest.raises(error, match=says):
+        run([-3, argument], workers=2)
+    assert time.monotonic() - start < 60
+
+
+def test_engines_that_cannot_be_had(monkeypatch):
+    with pytest.raises(RapidError, match="did you mean 'ray'"):
+        list(run_jobs(job, [1], engine="rax"))  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(RapidError, match=r"pip install 'rapid-driving\[ray\]'; or use --engine local"):
+        list(run_jobs(job, [1], engine="ray"))
+
+
+def test_another_version_is_refused():
+    kind, says = engines._attempt("0.0.0", job, 1, print)
+    assert kind == "refusal"
+    assert "the command 0.0.0" in says
