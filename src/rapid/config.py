@@ -66,6 +66,14 @@ class TeacherConfig:
     """Price of a million answer tokens."""
     replay_file: str = ""
     """Recorded answers (`replay`)."""
+    memory: str = ""
+    """File of past situations that the model is reminded of, such as the `memory.jsonl` of a dataset; it is only read.
+    With this or `reflect`, a `local` model in `digest` style answers in words instead of scoring them."""
+    few_shot: int = 0
+    """How many of the most similar past situations the model is shown at each decision; 0 is none."""
+    reflect: bool = False
+    """Remember each episode: its tightest moment, or after a crash what went wrong, which the model is asked. Written
+    to `memory.jsonl` in the dataset, after what `memory` held; name that file as `memory` for the next collection."""
 
 
 @dataclass(frozen=True)
@@ -522,6 +530,7 @@ def validate(config: Config) -> Config:
         (config.adapt.learning_starts >= 0, "adapt.learning_starts", config.adapt.learning_starts, "at least 0"),
         (config.teacher.concurrency >= 1, "teacher.concurrency", config.teacher.concurrency, "at least 1"),
         (config.teacher.max_turns >= 1, "teacher.max_turns", config.teacher.max_turns, "at least 1"),
+        (config.teacher.few_shot >= 0, "teacher.few_shot", config.teacher.few_shot, "at least 0"),
         (evaluate.spawns >= 1, "evaluate.spawns", evaluate.spawns, "at least 1"),
         (evaluate.teacher_spawns >= 0, "evaluate.teacher_spawns", evaluate.teacher_spawns, "at least 0"),
         (evaluate.planner_spawns >= 0, "evaluate.planner_spawns", evaluate.planner_spawns, "at least 0"),

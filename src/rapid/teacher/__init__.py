@@ -8,7 +8,27 @@ loads no model code.
 from rapid.config import TeacherConfig
 from rapid.teacher.decision import Decision, Teacher, from_record, to_record
 
-__all__ = ["Decision", "Teacher", "from_record", "make_teacher", "to_record"]
+__all__ = ["Decision", "Teacher", "check_teacher", "from_record", "make_teacher", "to_record"]
+
+
+def check_teacher(config: TeacherConfig, lanes: int) -> None:
+    """Look for everything that would keep :func:`make_teacher` from its end, short of fetching and loading a model.
+
+    Nothing is asked of a server: whether it is there and takes the key shows at the first decision.
+
+    Raises:
+        RapidError: a name that does not exist, a file that cannot be read, an address that is none, or settings that
+            do not go together.
+    """
+    from rapid.teacher.memory import open_memory
+
+    open_memory(config)
+    if config.backend == "local":
+        from rapid.teacher.models import is_present
+
+        is_present(config.model)
+    else:
+        make_teacher(config, lanes)
 
 
 def make_teacher(config: TeacherConfig, lanes: int, seed: int = 0) -> Teacher:

@@ -123,26 +123,28 @@ def softmax_over(scores_A: NDArray[np.float64], available: Sequence[int]) -> NDA
 def make_model_teacher(config: TeacherConfig, lanes: int, seed: int) -> Teacher:
     """Return the teacher of a backend that needs a model; see :func:`rapid.teacher.make_teacher`."""
     from rapid.teacher.conversation import ConversingTeacher
+    from rapid.teacher.memory import open_memory
 
+    memory = open_memory(config)
     identity = {"backend": config.backend, "model": config.model}
     if config.backend == "replay":
         from rapid.teacher.replay import Replay
 
-        return Replay(config, lanes)
+        return Replay(config, lanes, memory)
     if config.backend == "endpoint":
         from rapid.teacher.endpoint import Endpoint
 
-        return ConversingTeacher(Endpoint(config), config, {**identity, "base_url": config.base_url}, lanes)
+        return ConversingTeacher(Endpoint(config), config, {**identity, "base_url": config.base_url}, lanes, memory)
     from rapid.teacher.local import LocalChat, LocalModel
     from rapid.teacher.models import dense_folder
 
     folder, digest_sha256, template = dense_folder(config.model)
     model = LocalModel(folder, template)
     identity = {**identity, "weights_sha256": digest_sha256}
-    if config.style == "react":
+    if config.style == "react" or len(memory) or config.reflect:
         # One conversation after the other: they would compete for the same cores.
         chat = LocalChat(model, config.max_answer_tokens)
-        return ConversingTeacher(chat, dataclasses.replace(config, concurrency=1), identity, lanes)
+        return ConversingTeacher(chat, dataclasses.replace(config, concurrency=1), identity, lanes, memory)
     return ScoringTeacher(
         model, identity, lanes, stream_seed(seed, "teacher/shuffle") if config.shuffle_facts else None
     )

@@ -4,9 +4,10 @@ In `digest` style one word is asked for, so that the probabilities of the tokens
 them, are a soft label. In `react` style the decision follows from what was said before it and is certain by then.
 """
 
+import dataclasses
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
+from rapid.scenarios import IDLE
 from rapid.teacher.briefing import (
     DECISION_SCHEMA,
     EXPLANATION_LIMIT,
@@ -28,7 +30,16 @@ from rapid.teacher.briefing import (
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import Facts, gather, safest
 from rapid.teacher.logprobs import Token, action_probabilities
-from rapid.teacher.prompt import WORDS, outcome
+from rapid.teacher.memory import Episode, Experience, Memory, identify, show
+from rapid.teacher.prompt import WORDS, Prompt, outcome
+from rapid.teacher.reflection import (
+    LESSON_SCHEMA,
+    experience_of,
+    lesson_request,
+    moment,
+    read_lesson,
+    reflection_prompt,
+)
 from rapid.teacher.scene import read_scenes
 from rapid.teacher.tools import call_tool, tool_specifications
 
@@ -111,19 +122,34 @@ class _Talk:
         self.answer, self.tokens = reply.text, reply.tokens
 
 
-class ConversingTeacher:
-    """Asks a chat model, world by world, several at once."""
+def _opening(prompt: Prompt) -> list[Message]:
+    return [{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}]
 
-    def __init__(self, chat: Chat, config: TeacherConfig, identity: dict[str, Any], lanes: int) -> None:
-        self.name = f"{config.model} ({config.style})"
+
+class ConversingTeacher:
+    """Asks a chat model, world by world, several at once; reminds it of similar situations, if there is a memory.
+
+    `memory` is only read. It implements :class:`rapid.teacher.memory.Reflective` too.
+    """
+
+    def __init__(
+        self, chat: Chat, config: TeacherConfig, identity: dict[str, Any], lanes: int, memory: Memory | None = None
+    ) -> None:
+        shots = f", {config.few_shot}-shot" if config.few_shot else ""
+        self.name = f"{config.model} ({config.style}{shots})"
+        self.memory, self.reflects = memory or Memory(), config.reflect
         self._chat, self._config, self._identity, self._lanes = chat, config, identity, lanes
         self._failures = 0
 
     def describe(self) -> dict[str, Any]:
         """Return the teacher's identity."""
-        empty = np.zeros((1, 1, 5), np.float32)
-        prompt = briefing(gather(read_scenes(empty, self._lanes)[0]), None, self._config.style, False)
-        return {**self._identity, "style": self._config.style, "prompt": prompt.hash[:16]}
+        facts = gather(read_scenes(np.zeros((1, 1, 5), np.float32), self._lanes)[0])
+        prompt = briefing(facts, None, self._config.style, False, [""] if self._config.few_shot else [])
+        identity = {**self._identity, "style": self._config.style, "prompt": prompt.hash[:16]}
+        identity |= identify(self.memory, self._config.few_shot)
+        if self.reflects:
+            identity["reflection"] = reflection_prompt([facts], [Decision(IDLE)], 0).hash[:16]
+        return identity
 
     def decide(
         self,
@@ -141,18 +167,58 @@ class ConversingTeacher:
             decisions = list(pool.map(self._decide, all_facts, previous))
         for decision in decisions:
             lost = decision.status == "fallback" and decision.error.startswith("no answer")
-            self._failures = self._failures + 1 if lost else 0
-            if self._failures >= FAILURES_IN_A_ROW:
-                raise RapidError(
-                    f"The model's server failed {self._failures} decisions in a row; the last time: {decision.error}. "
-                    "Is it running and reachable? What was collected is kept: run the same command again."
-                )
+            self._watch(decision.error if lost else "")
         return decisions
+
+    def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
+        """Give one experience for each episode; see :class:`rapid.teacher.memory.Reflective`."""
+        with ThreadPoolExecutor(max(self._config.concurrency, 1)) as pool:
+            for experience, fault in pool.map(self._look_back, episodes):
+                self._watch(fault)
+                yield experience
+
+    def _watch(self, fault: str) -> None:
+        """Count what was lost to the server, and stop if it seems to be down."""
+        self._failures = self._failures + 1 if fault else 0
+        if self._failures >= FAILURES_IN_A_ROW:
+            raise RapidError(
+                f"The model's server failed {self._failures} decisions in a row; the last time: {fault}. "
+                "Is it running and reachable? What was collected is kept: run the same command again."
+            )
+
+    def _look_back(self, episode: Episode) -> tuple[Experience, str]:
+        """Return the experience, and what kept the server from answering, if something did."""
+        facts_T = [gather(scene) for scene in read_scenes(episode.obs_TVF, self._lanes)]
+        step = moment(episode, facts_T)
+        facts = facts_T[step]
+        experience = experience_of(episode, facts, step)
+        if not episode.crashed:
+            return experience, ""
+        talk = _Talk(_opening(reflection_prompt(facts_T, episode.decisions, step)))
+        choice, lost = Choice(None), ""
+        try:
+            choice = read_lesson(self._ask(talk, [], LESSON_SCHEMA).text, facts)
+            if choice.action is None:
+                talk.messages.append({"role": "user", "content": lesson_request(choice.fault, facts)})
+                choice = read_lesson(self._ask(talk, [], LESSON_SCHEMA).text, facts)
+        except ChatError as error:
+            lost = f"no answer: {error}"
+        if choice.action is not None:
+            # The reason was that of the decision that led to the crash.
+            experience = dataclasses.replace(
+                experience, action=choice.action, explanation="", lesson=choice.explanation
+            )
+        spent = {"tokens_in": talk.tokens_in, "tokens_out": talk.tokens_out, "cost": self._cost(talk)}
+        return dataclasses.replace(experience, **spent), lost
+
+    def _cost(self, talk: _Talk) -> float:
+        return (talk.tokens_in * self._config.price_in + talk.tokens_out * self._config.price_out) / 1e6
 
     def _decide(self, facts: Facts, previous: Decision | None) -> Decision:
         start = time.perf_counter()
-        prompt = briefing(facts, previous, self._config.style, self._chat.native_tools)
-        talk = _Talk([{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}])
+        examples = [show(experience) for experience in self.memory.recall(facts.scene, self._config.few_shot)]
+        prompt = briefing(facts, previous, self._config.style, self._chat.native_tools, examples)
+        talk = _Talk(_opening(prompt))
         choice = Choice(None)
         try:
             choice = read_choice(self._reason(talk, facts), facts, self._config.style)
@@ -174,7 +240,6 @@ class ConversingTeacher:
             # One word gives no reason: what was told about the action stands for it.
             explanation = choice.explanation or outcome(facts, action)
             probabilities = action_probabilities(talk.tokens, action, facts.available)
-        cost = (talk.tokens_in * self._config.price_in + talk.tokens_out * self._config.price_out) / 1e6
         return Decision(
             action,
             explanation=explanation,
@@ -188,7 +253,7 @@ class ConversingTeacher:
             tokens_in=talk.tokens_in,
             tokens_out=talk.tokens_out,
             seconds=time.perf_counter() - start,
-            cost=cost,
+            cost=self._cost(talk),
             transcript=json.dumps(talk.messages[1:]),
         )
 

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.files import sha256
+from rapid.files import read_json, sha256
 from rapid.teacher.briefing import briefing
 from rapid.teacher.decision import Decision, from_record
 from rapid.teacher.facts import Facts, gather, safest
+from rapid.teacher.memory import MEMORY_FILE, Memory, identify, read_memory, show
 from rapid.teacher.prompt import digest
 from rapid.teacher.scene import read_scenes
 
@@ -29,12 +30,14 @@ class Replay:
     Args:
         config: `replay_file` is a JSON-lines file of decisions, a teacher log in Parquet, or a dataset's directory.
         lanes: lanes of the road.
+        memory: what the recorded model was reminded of, `config.few_shot` at a time; not needed for a dataset, which
+            holds it.
 
     Raises:
         RapidError: there is no such recording, or it cannot be read, or holds no prompt's hash.
     """
 
-    def __init__(self, config: TeacherConfig, lanes: int) -> None:
+    def __init__(self, config: TeacherConfig, lanes: int, memory: Memory | None = None) -> None:
         path = Path(config.replay_file).expanduser()
         if path.is_dir():
             path /= "teacher_log.parquet"
@@ -45,6 +48,9 @@ class Replay:
             )
         self.name = f"replay of {path.parent.name if path.suffix == '.parquet' else path.name}"
         self._lanes, self._digest = lanes, sha256(path)
+        self._memory, self._few_shot = memory or Memory(), config.few_shot
+        if not self._few_shot:
+            self._memory, self._few_shot = _recorded_memory(path.parent)
         self._decisions: dict[str, Decision] = {}
         for decision in _read_parquet(path) if path.suffix == ".parquet" else _read_lines(path):
             if decision.prompt_hash:
@@ -54,7 +60,8 @@ class Replay:
 
     def describe(self) -> dict[str, Any]:
         """Return the teacher's identity."""
-        return {"backend": "replay", "model": self.name, "recording_sha256": self._digest}
+        identity: dict[str, Any] = {"backend": "replay", "model": self.name, "recording_sha256": self._digest}
+        return identity | identify(self._memory, self._few_shot)
 
     def decide(
         self,
@@ -73,8 +80,11 @@ class Replay:
         start = time.perf_counter()
         # One recording may hold several kinds of prompt; the first that is known answers.
         prompts = [digest(facts)]
+        examples = [show(experience) for experience in self._memory.recall(facts.scene, self._few_shot)]
         prompts += [
-            briefing(facts, previous, style, native) for style in ("digest", "react") for native in (True, False)
+            briefing(facts, previous, style, native, examples)
+            for style in ("digest", "react")
+            for native in (True, False)
         ]
         found = next((self._decisions[p.hash] for p in prompts if p.hash in self._decisions), None)
         seconds = time.perf_counter() - start
@@ -84,6 +94,19 @@ class Replay:
                 safest(facts), prompt_hash=prompts[0].hash, status="fallback", error=missing, seconds=seconds
             )
         return replace(found, seconds=seconds, tokens_in=0, tokens_out=0, cost=0.0)
+
+
+def _recorded_memory(dataset: Path) -> tuple[Memory, int]:
+    """Return what the driver of a dataset was reminded of, and how many situations at a time."""
+    if not (dataset / MEMORY_FILE).is_file() or not (dataset / "dataset.json").is_file():
+        return Memory(), 0
+    try:
+        told = read_json(dataset / "dataset.json", "dataset")["drivers"]["teacher"].get("memory")
+        # What the collection itself taught stands behind it.
+        memory = Memory(read_memory(dataset / MEMORY_FILE).experiences[: told["experiences"]] if told else ())
+        return memory, told["few_shot"] if told else 0
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RapidError(f"'{dataset / 'dataset.json'}' lacks {error}. It was edited or damaged.") from error
 
 
 def _read_lines(path: Path) -> Iterator[Decision]:
