@@ -66,7 +66,8 @@ class Block(nn.Module):
 
     def _heads(self, rows: Tensor, length: int, parts: int) -> tuple[Tensor, ...]:
         split = rows.view(-1, length, parts, self.heads, rows.shape[-1] // (parts * self.heads))
-        return split.permute(2, 0, 3, 1, 4).unbind(0)
+        # Taken apart before it is transposed, so that the gradient is put together in place, without another copy.
+        return tuple(part.transpose(1, 2) for part in split.unbind(2))
 
 
 class Transformer(nn.Module):

@@ -47,21 +47,29 @@ class Encoding(nn.Module):
 
     scale_F: Tensor
     unit_F: Tensor
+    absent_V1: Tensor
+    """Presence up to which a row is absent."""
+    relative_VF: Tensor
+    """1 where the ego's feature is taken off, in `ego`."""
 
     def __init__(self, kind: Literal["raw", "normalized", "ego"], lanes: int, mask_absent: bool) -> None:
         super().__init__()
         self.kind, self.mask_absent = kind, mask_absent
         self.register_buffer("scale_F", feature_scale(lanes))
         self.register_buffer("unit_F", torch.tensor(EGO_UNITS))
-        # Row 0 is always the ego, and there must be something to attend to.
-        self.register_buffer("_is_ego_V1", (torch.arange(NUM_VEHICLES) == 0)[:, None], persistent=False)
+        is_ego_V1 = (torch.arange(NUM_VEHICLES) == 0)[:, None]
+        # Row 0 is always the ego, whatever its presence says, and there must be something to attend to.
+        self.register_buffer("absent_V1", torch.where(is_ego_V1, -torch.inf, 0.5), persistent=False)
+        # Which of the ego's features are taken off: from the others all but presence, from itself x alone.
+        kept_VF = torch.tensor([1.0, 0.0, 1.0, 1.0, 1.0]).where(is_ego_V1, torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0]))
+        self.register_buffer("relative_VF", 1 - kept_VF, persistent=False)
 
     def forward(self, obs_BVF: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the features (B, V, F) and the mask to add to attention scores (B, 1, 1, V), or None."""
         features_BVF = self._features(obs_BVF)
         if not self.mask_absent:
             return features_BVF, None
-        present_BV1 = (obs_BVF[..., :1] > 0.5) | self.get_buffer("_is_ego_V1")
+        present_BV1 = obs_BVF[..., :1] > self.absent_V1
         mask_BV = torch.where(present_BV1, 0.0, -torch.inf).squeeze(-1)
         return torch.where(present_BV1, features_BVF, 0.0), mask_BV[:, None, None, :]
 
@@ -70,7 +78,4 @@ class Encoding(nn.Module):
             return obs_BVF
         if self.kind == "normalized":
             return normalize(obs_BVF, self.scale_F)
-        ego_B1F = obs_BVF[:, :1]
-        others_BVF = torch.cat([obs_BVF[:, 1:, :1], obs_BVF[:, 1:, 1:] - ego_B1F[..., 1:]], -1)
-        own_B1F = torch.cat([ego_B1F[..., :1], torch.zeros_like(ego_B1F[..., :1]), ego_B1F[..., 2:]], -1)
-        return torch.cat([own_B1F, others_BVF], 1) / self.unit_F
+        return (obs_BVF - obs_BVF[:, :1] * self.relative_VF) / self.unit_F
