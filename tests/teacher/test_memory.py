@@ -11,20 +11,9 @@ from rapid.errors import RapidError
 from rapid.teacher import check_teacher
 from rapid.teacher.conversation import FAILURES_IN_A_ROW, ChatError, ConversingTeacher, Reply
 from rapid.teacher.decision import Decision, to_record
+from rapid.teacher.experience import SITUATION_SIZE, Experience, read_experiences, to_lines
 from rapid.teacher.facts import gather
-from rapid.teacher.memory import (
-    SITUATION_SIZE,
-    Episode,
-    Experience,
-    Memory,
-    Reflective,
-    describe,
-    quote,
-    read_memory,
-    show,
-    situation,
-    to_lines,
-)
+from rapid.teacher.memory import Episode, Memory, Reflective, describe, quote, show, situation
 from rapid.teacher.reflection import moment
 from rapid.teacher.replay import Replay
 from rapid.teacher.scene import read_scenes
@@ -155,13 +144,13 @@ def test_what_a_memory_says_stays_data(world, text):
 def test_a_memory_survives_its_file(memory, tmp_path):
     path = tmp_path / "memory.jsonl"
     path.write_text(to_lines(memory.experiences), encoding="utf-8")
-    again = read_memory(path)
+    again = Memory(read_experiences(path))
     assert again.experiences == memory.experiences
     assert again.sha256 == memory.sha256
     assert to_lines(again.experiences) == path.read_text(encoding="utf-8")
 
 
-GOOD = {"situation": [0.0] * SITUATION_SIZE, "facts": "f", "decision": "keep"}
+GOOD = {"situation": [0.0] * SITUATION_SIZE, "facts": "f", "action": "IDLE"}
 
 
 @pytest.mark.parametrize(
@@ -174,13 +163,13 @@ GOOD = {"situation": [0.0] * SITUATION_SIZE, "facts": "f", "decision": "keep"}
         (b"{", "There is no JSON in line 1"),
         (b"[" * 100_000, "There is no JSON in line 1"),
         (b"[]", "not a JSON object"),
-        ({}, "lacks situation, facts, decision"),
+        ({}, "lacks situation, facts, action"),
         ({**GOOD, "situation": [0.0]}, "not a list of 15 numbers"),
         ({**GOOD, "situation": [True] * 15}, "not a number"),
         ({**GOOD, "situation": [float("nan")] * 15}, "not a number"),
         ({**GOOD, "situation": [10**400] * 15}, "not a number"),
-        ({**GOOD, "decision": "fly"}, "none of left, keep"),
-        ({**GOOD, "decision": 1}, "decision has the wrong type"),
+        ({**GOOD, "action": "fly"}, "none of LANE_LEFT, IDLE"),
+        ({**GOOD, "action": 1}, "action has the wrong type"),
         ({**GOOD, "lesson": None}, "lesson has the wrong type"),
         ({**GOOD, "cost": float("inf")}, "cost is not finite"),
         ({**GOOD, "wrong": 1}, "unknown field 'wrong'"),

@@ -49,6 +49,8 @@ def card(dataset: Dataset) -> str:
         ]
     if "decisions" in facts:
         lines += ["", "## Decisions", "", *_decision_lines(facts["decisions"], len(dataset))]
+    if "memory" in facts:
+        lines += ["", "## Memory", "", *_memory_lines(facts["memory"])]
     lines += ["", "## Drivers"]
     for name, identity in dataset.drivers.items():
         lines += ["", f"`{name}`:", "", "```json", json.dumps(identity, indent=2, ensure_ascii=False), "```"]
@@ -67,6 +69,15 @@ def _decision_lines(decisions: dict[str, Any], count: int) -> list[str]:
     ]
 
 
+def _memory_lines(memory: dict[str, Any]) -> list[str]:
+    """Return what the memory holds, as a list."""
+    return [
+        f"- {memory['known']} experiences that the teacher had, {memory['learned']} that it gained here, "
+        f"{memory['lessons']} of them with a lesson from a crash",
+        f"- Reflections: {memory['tokens_in']} tokens read, {memory['tokens_out']} written, cost {memory['cost']:g}",
+    ]
+
+
 _READING = (
     "- `rapid.load_dataset(directory)` checks the files against their hashes and gives `Transitions` (NumPy arrays).",
     "- `transitions.parquet`: one row a step. `obs` is 15 vehicles × 5 features (presence, x, y, vx, vy; metres and "
@@ -74,4 +85,5 @@ _READING = (
     "crash, `truncated` the clock. `source` 0 is the teacher, 1 the random driver.",
     "- `teacher_log.parquet`: one row a decision, with prompt hash, answer, explanation, status, tokens, seconds and "
     "transcript.",
+    "- `memory.jsonl`, if the teacher has a memory: one line an experience, those that it had first.",
 )

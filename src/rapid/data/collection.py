@@ -1,8 +1,9 @@
 """Phase 1, collecting: a driver in many episodes side by side, every decision safe on disk (paper: sections 3.1, 4.2).
 
 A directory in progress holds ``collecting/``: the settings, a Parquet part for each finished group of episodes and the
-journal of the group in progress. A complete one holds the dataset alone. The same command goes on wherever a process
-was ended, by any signal, and ends with the same bytes as if it had never been.
+journal of the group in progress, and what a teacher that reflects has learned so far. A complete one holds the dataset
+alone. The same command goes on wherever a process was ended, by any signal, and ends with the same bytes as if it had
+never been.
 """
 
 import json
@@ -18,11 +19,12 @@ from rapid.data.driving import Budget, Collecting, MakeWorlds, SpentError, Tally
 from rapid.data.journal import exclusive
 from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
 from rapid.errors import RapidError
-from rapid.files import read_json, write_json
+from rapid.files import read_json, write_json, write_text
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.spawns import TrainPart, train_part
 from rapid.teacher.decision import Teacher
+from rapid.teacher.experience import MEMORY_FILE, to_lines
 
 
 def parse_shard(shard: str) -> tuple[int, int]:
@@ -150,6 +152,7 @@ def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
     for path in work.glob("part-*"):
         path.unlink()
     (work / "journal.jsonl").unlink(missing_ok=True)
+    (work / MEMORY_FILE).unlink(missing_ok=True)
     (work / "settings.json").unlink(missing_ok=True)
     return dataset
 
@@ -162,4 +165,7 @@ def _reopen(dataset: Dataset, work: Path) -> None:
     for field in PART_SCHEMA:
         if field.name not in table.column_names:
             table = table.append_column(field, dataset.log.column(field.name))
+    if dataset.memory is not None:
+        # First: an episode in a part that is not in the memory would be looked back on again.
+        write_text(work / MEMORY_FILE, to_lines(dataset.memory[dataset.known :]))
     write_parquet(table.cast(PART_SCHEMA), work / "part-00000.parquet")

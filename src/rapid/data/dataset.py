@@ -13,9 +13,10 @@ import pyarrow as pa
 from rapid.data.tables import from_table, read_parquet, to_table, write_parquet
 from rapid.data.transitions import RANDOM, SOURCES, TEACHER, Transitions, concatenate
 from rapid.errors import RapidError
-from rapid.files import read_json, sha256, write_json
+from rapid.files import read_json, sha256, write_json, write_text
 from rapid.scenarios import ACTIONS, get_scenario
 from rapid.seeding import numpy_stream
+from rapid.teacher.experience import MEMORY_FILE, Experience, read_experiences, to_lines
 
 SCHEMA_VERSION = 1
 DATASET_FILE, TRANSITIONS_FILE, LOG_FILE = "dataset.json", "transitions.parquet", "teacher_log.parquet"
@@ -40,9 +41,16 @@ class Dataset:
     """How it was mixed: p, size, level, seed, and the summary of each source; None if it was collected."""
     collection: dict[str, Any] | None = None
     """How it was collected: seeds, shard, whether it is complete."""
+    memory: tuple[Experience, ...] | None = None
+    """What the teacher remembered while it drove, and then what it learned; None if it has no memory."""
 
     def __len__(self) -> int:
         return len(self.transitions)
+
+    @property
+    def known(self) -> int:
+        """Experiences in the memory that the teacher had before; what follows it learned here."""
+        return max((driver.get("memory", {}).get("experiences", 0) for driver in self.drivers.values()), default=0)
 
     @property
     def teacher_share(self) -> float | None:
@@ -64,6 +72,10 @@ def save_dataset(dataset: Dataset, directory: str | os.PathLike[str]) -> None:
         tables[LOG_FILE] = dataset.log
     for name, table in tables.items():
         write_parquet(table, root / name)
+    rows = {name: table.num_rows for name, table in tables.items()}
+    if dataset.memory is not None:
+        write_text(root / MEMORY_FILE, to_lines(dataset.memory))
+        rows[MEMORY_FILE] = len(dataset.memory)
     write_json(
         root / DATASET_FILE,
         {
@@ -76,8 +88,8 @@ def save_dataset(dataset: Dataset, directory: str | os.PathLike[str]) -> None:
             "summary": summary(dataset),
             "licence": LICENCE,
             "files": {
-                name: {"rows": table.num_rows, "bytes": (root / name).stat().st_size, "sha256": sha256(root / name)}
-                for name, table in tables.items()
+                name: {"rows": count, "bytes": (root / name).stat().st_size, "sha256": sha256(root / name)}
+                for name, count in rows.items()
             },
         },
     )
@@ -104,8 +116,9 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
             _check_file(root / name, facts)
         table = read_parquet(root / TRANSITIONS_FILE, "transitions")
         log = read_parquet(root / LOG_FILE, "teacher log") if LOG_FILE in meta["files"] else None
+        memory = read_experiences(root / MEMORY_FILE) if MEMORY_FILE in meta["files"] else None
         dataset = Dataset(
-            meta["scenario"], from_table(table), meta["drivers"], log, meta["mixture"], meta["collection"]
+            meta["scenario"], from_table(table), meta["drivers"], log, meta["mixture"], meta["collection"], memory
         )
     except (KeyError, TypeError, AttributeError) as error:
         raise RapidError(
@@ -176,6 +189,16 @@ def summary(dataset: Dataset) -> dict[str, Any]:
         for name in ("retries", "tokens_in", "tokens_out", "seconds", "cost"):
             decisions[name] = _round(np.nansum(log.column(name).to_numpy().astype(np.float64)))
         result["decisions"] = decisions
+    if dataset.memory is not None:
+        learned = dataset.memory[dataset.known :]
+        result["memory"] = {
+            "known": dataset.known,
+            "learned": len(learned),
+            "lessons": sum(bool(experience.lesson) for experience in learned),
+            "tokens_in": sum(experience.tokens_in for experience in learned),
+            "tokens_out": sum(experience.tokens_out for experience in learned),
+            "cost": _round(sum(experience.cost for experience in learned)),
+        }
     return result
 
 
@@ -262,4 +285,9 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
             log.schema.get_field_index("episode"), log.schema.field("episode"), pa.array(transitions.episode_N)
         )
     collection = {"shards": [dataset.collection for dataset in datasets]}
-    return Dataset(first.scenario, transitions, first.drivers, log, collection=collection)
+    memory = first.memory
+    if memory is not None:
+        # Every shard began with the same memory, which the drivers' identities vouch for.
+        learned = [experience for dataset in datasets for experience in (dataset.memory or ())[dataset.known :]]
+        memory = (*memory[: first.known], *learned)
+    return Dataset(first.scenario, transitions, first.drivers, log, collection=collection, memory=memory)

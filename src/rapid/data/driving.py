@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from rapid.data.dataset import Dataset
+from rapid.data.hindsight import Hindsight
 from rapid.data.journal import Journal
 from rapid.data.tables import (
     LOG_SCHEMA,
@@ -27,6 +28,7 @@ from rapid.progress import Task
 from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
 from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision, Teacher
+from rapid.teacher.experience import MEMORY_FILE, Experience
 
 MakeWorlds = Callable[[int], Any]
 """Gives a vector environment of so many worlds, in which a finished world waits for the others."""
@@ -91,6 +93,9 @@ class Collecting:
         self.tokens = int(sum(self._sum(name) for name in ("tokens_in", "tokens_out")))
         self.cost = self._sum("cost")
         self.fallbacks = sum(part.column("status").to_pylist().count("fallback") for part in self.parts)
+        self.hindsight, self.looked_back = Hindsight(work / MEMORY_FILE, teacher), 0
+        for experience in self.hindsight.experiences:
+            self._charge(experience)
         self.start = time.monotonic()
         if progress:
             progress.skip(self.count)
@@ -100,6 +105,7 @@ class Collecting:
         duration = int(get_scenario(self.settings["scenario"]).config()["duration"])
         worlds: Any = None
         try:
+            self._look_back()
             while self.count < target:
                 journal = Journal(self.work / "journal.jsonl", len(self.parts))
                 try:
@@ -130,6 +136,7 @@ class Collecting:
                 self.parts.append(part)
                 self.count += part.num_rows
                 self.episodes += len(group)
+                self._look_back()
         except SpentError as spent:
             return str(spent)
         finally:
@@ -179,6 +186,19 @@ class Collecting:
             self._show(len(decisions))
         return self._table(sorted(steps, key=lambda row: row["world"]), seeds)
 
+    def _look_back(self) -> None:
+        """Let a teacher that reflects learn from the finished episodes, once from each."""
+        while self.looked_back < len(self.parts):
+            if episodes := self.hindsight.pending(self.parts[self.looked_back]):
+                self._check_budget(0)
+                for experience in self.hindsight.look_back(episodes):
+                    self._charge(experience)
+            self.looked_back += 1
+
+    def _charge(self, experience: Experience) -> None:
+        self.tokens += experience.tokens_in + experience.tokens_out
+        self.cost += experience.cost
+
     def _table(self, steps: list[dict[str, Any]], seeds: list[int]) -> pa.Table:
         """Return the steps of a group as a table of `PART_SCHEMA`."""
         said: list[Decision] = [row["decision"] for row in steps]
@@ -212,6 +232,7 @@ class Collecting:
             drivers={self.settings["source"]: self.settings["driver"]},
             log=table.select(LOG_SCHEMA.names).combine_chunks(),
             collection={"complete": complete, "settings": self.settings},
+            memory=self.hindsight.memory,
         )
 
     def _sum(self, name: str) -> float:

@@ -28,6 +28,7 @@ from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.spawns import TrainPart, train_part
 from rapid.teacher.decision import Teacher
+from rapid.teacher.experience import MEMORY_FILE
 
 MAX_SHARDS = 1000
 _BETWEEN_REPORTS = 1.0
@@ -267,8 +268,10 @@ def _rows(directory: Path) -> int:
 
 def _read(directory: Path) -> dict[str, bytes]:
     """Return the files of a dataset, the one that vouches for the others last; nothing if there is none."""
-    names = (TRANSITIONS_FILE, LOG_FILE, DATASET_FILE)
-    return {name: (directory / name).read_bytes() for name in names if (directory / DATASET_FILE).exists()}
+    if not (directory / DATASET_FILE).exists():
+        return {}
+    names = (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE, DATASET_FILE)
+    return {name: (directory / name).read_bytes() for name in names if (directory / name).exists()}
 
 
 def _write(directory: Path, files: Mapping[str, bytes]) -> None:
@@ -309,6 +312,11 @@ def _split(dataset: Dataset, work: Path) -> None:
         own = concatenate([replace(own, episode_N=own.episode_N - own.episode_N.min())])
         place = log.schema.get_field_index("episode")
         own_log = log.take(pa.array(index)).set_column(place, log.schema.field("episode"), pa.array(own.episode_N))
+        memory = dataset.memory
+        if memory is not None:
+            learned = [past for past in memory[dataset.known :] if past.spawn_seed in seeds]
+            memory = (*memory[: dataset.known], *learned)
         save_dataset(
-            Dataset(dataset.scenario, own, dataset.drivers, own_log, collection=collection), _place(work, part, shards)
+            Dataset(dataset.scenario, own, dataset.drivers, own_log, collection=collection, memory=memory),
+            _place(work, part, shards),
         )

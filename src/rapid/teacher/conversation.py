@@ -28,9 +28,10 @@ from rapid.teacher.briefing import (
     repair_request,
 )
 from rapid.teacher.decision import Decision
+from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts, gather, safest
 from rapid.teacher.logprobs import Token, action_probabilities
-from rapid.teacher.memory import Episode, Experience, Memory, identify, show
+from rapid.teacher.memory import Episode, Memory, identify, show
 from rapid.teacher.prompt import WORDS, Prompt, outcome
 from rapid.teacher.reflection import (
     LESSON_SCHEMA,

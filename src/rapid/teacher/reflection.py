@@ -6,8 +6,9 @@ from typing import Any
 from rapid.scenarios import SLOWER
 from rapid.teacher.briefing import Choice, read_choice
 from rapid.teacher.decision import Decision
+from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts
-from rapid.teacher.memory import Episode, Experience, describe, quote, situation
+from rapid.teacher.memory import Episode, describe, quote, situation
 from rapid.teacher.prompt import WORDS, Prompt
 
 SHOWN = 5

@@ -15,8 +15,9 @@ from rapid.errors import RapidError
 from rapid.files import read_json, sha256
 from rapid.teacher.briefing import briefing
 from rapid.teacher.decision import Decision, from_record
+from rapid.teacher.experience import MEMORY_FILE, read_experiences
 from rapid.teacher.facts import Facts, gather, safest
-from rapid.teacher.memory import MEMORY_FILE, Memory, identify, read_memory, show
+from rapid.teacher.memory import Memory, identify, show
 from rapid.teacher.prompt import digest
 from rapid.teacher.scene import read_scenes
 
@@ -103,7 +104,7 @@ def _recorded_memory(dataset: Path) -> tuple[Memory, int]:
     try:
         told = read_json(dataset / "dataset.json", "dataset")["drivers"]["teacher"].get("memory")
         # What the collection itself taught stands behind it.
-        memory = Memory(read_memory(dataset / MEMORY_FILE).experiences[: told["experiences"]] if told else ())
+        memory = Memory(read_experiences(dataset / MEMORY_FILE)[: told["experiences"]] if told else ())
         return memory, told["few_shot"] if told else 0
     except (KeyError, TypeError, AttributeError) as error:
         raise RapidError(f"'{dataset / 'dataset.json'}' lacks {error}. It was edited or damaged.") from error
