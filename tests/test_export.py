@@ -1,19 +1,22 @@
 """ONNX: the same Q-values, and clear words when something is missing."""
 
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from rapid.cli import main
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
-from rapid.export import OnnxAgent, export_onnx
-from rapid.networks.agent import QAgent
+from rapid.export import OnnxAgent, export_onnx, latency
+from rapid.networks.agent import QAgent, save_agent
 from rapid.networks.q_network import build_network
 
 pytest.importorskip("onnxruntime")
-pytest.importorskip("onnxscript")
+pytest.importorskip("onnx")
 
 SMALL = {"width": 16, "heads": 2, "feedforward": 32, "layers": 1, "hidden": (16,)}
 
@@ -22,16 +25,19 @@ def make(**settings) -> QAgent:
     return QAgent(build_network(NetworkConfig(**{**SMALL, **settings}), 3, 0), "pupil")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("opened", [False, True])
-def test_an_exported_agent_drives_the_same(roads, tmp_path, opened):
-    agent, obs = make(num_policies=3, top_k=2), roads(9, absent=0.4).numpy()
-    mixture = agent.network.head.mixture
-    if opened:
-        torch.nn.init.normal_(mixture.gate_NV)
-    difference = export_onnx(agent, tmp_path / "pupil.onnx", obs)
-    assert difference < 1e-5
-    assert mixture.always_run is None
+def opened(agent: QAgent) -> QAgent:
+    gate = getattr(getattr(agent.network.head, "mixture", None), "gate_NV", None)
+    if gate is not None:
+        torch.nn.init.normal_(gate)
+    return agent
+
+
+def test_an_exported_agent_drives_the_same(roads, tmp_path):
+    agent, obs = opened(make(num_policies=3, top_k=2)), roads(9, absent=0.4).numpy()
+    parity = export_onnx(agent, tmp_path / "pupil.onnx", obs)
+    assert parity.observations == 9
+    assert parity.difference < 1e-5
+    assert parity.agreement == 1
     exported = OnnxAgent(tmp_path / "pupil.onnx")
     assert exported.name == "pupil"
     assert exported.metadata["lanes"] == 3
@@ -41,6 +47,63 @@ def test_an_exported_agent_drives_the_same(roads, tmp_path, opened):
     assert (exported.act(obs) == agent.act(obs)).all()
     with pytest.raises(RapidError, match="not finite"):
         exported.act(obs * np.nan)
+    assert latency(tmp_path / "pupil.onnx", obs[0], calls=5) > 0
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"kind": "mlp", "input": "raw", "mask_absent": False},
+        {"kind": "mlp", "hidden": (16, 8)},
+        {"kind": "mlp-mixture", "input": "normalized"},
+        {"kind": "attentive", "position": "none", "action_token": "ego"},
+        {"kind": "attentive", "position": "sinusoidal", "layers": 2, "decoder_layers": 2, "heads": 4},
+        {"kind": "rapid", "input": "raw", "position": "learned", "mask_absent": False, "decoder_layers": 2},
+        {"kind": "rapid", "input": "normalized", "action_token": "ego", "decoder_layers": 2},
+        {"kind": "rapid", "gate": "tanh"},
+        {"kind": "rapid", "gate": "tanh", "num_policies": 4, "top_k": 3},
+        {"kind": "rapid", "num_policies": 4, "top_k": 1},
+        {"kind": "rapid", "num_policies": 1, "top_k": 1},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("gate", ["closed", "open"])
+def test_every_kind_of_network_exports(roads, tmp_path, settings, gate):
+    agent = make(**settings) if gate == "closed" else opened(make(**settings))
+    if agent.network.config.kind == "mlp-mixture" and gate == "open":
+        torch.nn.init.normal_(agent.network.head.weights_N)
+    obs = roads(9, absent=0.4).numpy()
+    obs[0, 0, 0] = 0  # The ego counts whatever its presence says.
+    expected = agent.q_values(obs)
+    assert export_onnx(agent, tmp_path / "x.onnx", obs).difference < 1e-5 * max(1, np.abs(expected).max())
+
+
+def test_a_closed_gate_leaves_its_adapters_out(roads, tmp_path):
+    agent, obs = make(num_policies=3), roads(2).numpy()
+    export_onnx(agent, tmp_path / "closed.onnx", obs)
+    export_onnx(opened(agent), tmp_path / "open.onnx", obs)
+    assert (tmp_path / "open.onnx").stat().st_size > 1.5 * (tmp_path / "closed.onnx").stat().st_size
+
+
+def test_the_verb_exports_and_the_example_drives_without_torch(roads, tmp_path, capsys):
+    save_agent(tmp_path / "agent", make(kind="attentive").network, {"name": "pupil", "scenario": "lane-3-density-2"})
+    with pytest.raises(SystemExit) as ended:
+        main(["export", str(tmp_path / "agent"), "--out", str(tmp_path / "pupil.onnx")])
+    assert ended.value.code == 0
+    printed = capsys.readouterr().out
+    for words in ("largest difference of Q-values", "the same action on 100.00%", "microseconds (median)"):
+        assert words in printed
+    example = Path(__file__).parents[1] / "examples" / "drive_onnx.py"
+    assert len(example.read_text().splitlines()) <= 30
+    command = [sys.executable, str(example), str(tmp_path / "pupil.onnx"), "1"]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "episode 0: return" in told
+    assert "torch was not needed" in told
+
+
+def test_the_check_needs_observations(roads, tmp_path):
+    with pytest.raises(RapidError, match="no observations to compare"):
+        export_onnx(make(kind="mlp"), tmp_path / "x.onnx", roads(1).numpy()[:0])
 
 
 def test_a_model_that_differs_is_not_written(roads, tmp_path, monkeypatch):
@@ -88,7 +151,7 @@ def test_missing_files_and_packages_are_explained(roads, tmp_path, monkeypatch):
     (tmp_path / "bad.onnx").write_bytes(b"not a model")
     with pytest.raises(RapidError, match="cannot be loaded"):
         OnnxAgent(tmp_path / "bad.onnx")
-    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(RapidError, match=r"rapid-driving\[export\]"):
         export_onnx(make(kind="mlp"), tmp_path / "x.onnx", roads(1).numpy())
     monkeypatch.setitem(sys.modules, "onnxruntime", None)

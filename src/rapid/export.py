@@ -3,27 +3,22 @@
 The model reads `obs` (batch, 15, 5), float32, raw as the environment gives it, and returns `q` (batch, 5).
 """
 
-import contextlib
-import io
 import json
-import logging
 import os
-import warnings
-from collections.abc import Generator
+import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from rapid import files
 from rapid.errors import RapidError
+from rapid.graph import build_model
 from rapid.networks.agent import QAgent, check_observations
-from rapid.networks.q_network import QNetwork, TokenHead
 from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
 
 METADATA_KEY = "rapid"
-OPSET = 20
 TOLERANCE = 1e-4
 """Largest difference allowed between the Q-values of the exported model and the network, relative to their size."""
 
@@ -46,13 +41,15 @@ class OnnxAgent:
             raise RapidError(f"There is no ONNX model at '{path}'. Check the path, or make it with `rapid export`.")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.execution_mode = runtime.ExecutionMode.ORT_SEQUENTIAL
+        options.graph_optimization_level = runtime.GraphOptimizationLevel.ORT_ENABLE_ALL
         options.log_severity_level = 3
         try:
-            self._session = runtime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
+            self.session = runtime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors share no base class that it exports.
             raise RapidError(f"The ONNX model '{path}' cannot be loaded: {error} Export it again.") from error
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        self._input, self._output = inputs[0].name, outputs[0].name
+        inputs, outputs = self.session.get_inputs(), self.session.get_outputs()
+        self.input, self.output = inputs[0].name, outputs[0].name
         shape = list(inputs[0].shape)
         flat = NUM_VEHICLES * NUM_FEATURES
         if len(inputs) != 1 or shape[1:] not in ([NUM_VEHICLES, NUM_FEATURES], [flat]):
@@ -65,10 +62,10 @@ class OnnxAgent:
                 f"The ONNX model '{path}' returns shape {outputs[0].shape}, but an agent returns Q-values (batch, "
                 f"{len(ACTIONS)}), one for each of {', '.join(ACTIONS)}. Export it with that output."
             )
-        self._flat = len(shape) == 2
+        self.flat = len(shape) == 2
         self.name = name or Path(path).stem
         self.metadata: dict[str, Any] = json.loads(
-            self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
+            self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
         )
 
     def act(self, obs_BVF: np.ndarray) -> np.ndarray:
@@ -86,11 +83,22 @@ class OnnxAgent:
             RapidError: the observations have the wrong shape or are not finite.
         """
         obs_BVF = check_observations(obs_BVF, self.name)
-        values = obs_BVF.reshape(len(obs_BVF), -1) if self._flat else obs_BVF
-        return np.asarray(self._session.run([self._output], {self._input: values})[0])
+        values = obs_BVF.reshape(len(obs_BVF), -1) if self.flat else obs_BVF
+        return np.asarray(self.session.run([self.output], {self.input: values})[0])
 
 
-def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray) -> float:
+class Parity(NamedTuple):
+    """How an exported model compares with its network."""
+
+    observations: int
+    """Observations compared."""
+    difference: float
+    """The largest difference between Q-values."""
+    agreement: float
+    """Share of observations on which both are greedy for the same action."""
+
+
+def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray) -> Parity:
     """Write an agent's network as ONNX and compare the two on given observations.
 
     Adapters that a closed gate shuts out are left out of the file.
@@ -100,78 +108,70 @@ def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray
         path: the file; written only if the comparison succeeds.
         obs_BVF: real observations (B, V, F) for the comparison.
 
-    Returns:
-        The largest difference between Q-values.
-
     Raises:
-        RapidError: the extra `export` is not installed, or the exported model gives other Q-values.
+        RapidError: the extra `export` is not installed, there are no observations, or the exported model gives other
+            Q-values or actions.
     """
     _import_onnxruntime()
     try:
         import onnx
-        import onnxscript  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
-        raise RapidError(
-            "Exporting needs onnx and onnxscript. Install them: pip install 'rapid-driving[export]'"
-        ) from error
+        raise RapidError("Exporting needs onnx. Install it: pip install 'rapid-driving[export]'") from error
     obs_BVF = check_observations(obs_BVF, agent.name)
+    if not len(obs_BVF):
+        raise RapidError("There are no observations to compare the exported model on. Give a dataset with transitions.")
     network = agent.network
-    example = torch.zeros(2, NUM_VEHICLES, NUM_FEATURES, device=network.scale_F.device)
+    description = {"name": agent.name, "lanes": network.lanes, "features": FEATURES, "actions": ACTIONS}
+    model = build_model(network)
+    onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(description)})
     with files.atomic_path(path) as temporary:
-        with _static(network), _quiet():
-            program = torch.onnx.export(
-                network,
-                (example,),
-                dynamo=True,
-                input_names=["obs"],
-                output_names=["q"],
-                dynamic_shapes=({0: torch.export.Dim("batch")},),
-                opset_version=OPSET,
-                verbose=False,
-            )
-        assert program is not None
-        model = program.model_proto
-        description = {"name": agent.name, "lanes": network.lanes, "features": FEATURES, "actions": ACTIONS}
-        onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(description)})
         onnx.save(model, os.fspath(temporary))
         expected = agent.q_values(obs_BVF)
-        difference = float(np.abs(OnnxAgent(temporary, agent.name).q_values(obs_BVF) - expected).max(initial=0))
-        allowed = TOLERANCE * max(1.0, float(np.abs(expected).max(initial=0)))
+        exported = OnnxAgent(temporary, agent.name).q_values(obs_BVF)
+        difference = float(np.abs(exported - expected).max())
+        allowed = TOLERANCE * max(1.0, float(np.abs(expected).max()))
         if not difference <= allowed:
             raise RapidError(
                 f"The exported model's Q-values differ by {difference:.2g} from the agent's, more than {allowed:.2g}; "
-                f"'{path}' was not written. Try another version of torch or onnxruntime."
+                f"'{path}' was not written. Try another version of onnxruntime, and report this agent."
             )
-    return difference
+        # Where two actions are equally good up to rounding, either is right.
+        chosen_B = np.take_along_axis(expected, exported.argmax(1, keepdims=True), 1)[:, 0]
+        wrong = int((expected.max(1) - chosen_B > 2 * allowed).sum())
+        if wrong:
+            raise RapidError(
+                f"The exported model chooses another action on {wrong} of {len(obs_BVF)} observations; '{path}' was "
+                "not written. Try another version of onnxruntime, and report this agent."
+            )
+    return Parity(len(obs_BVF), difference, float((exported.argmax(1) == expected.argmax(1)).mean()))
 
 
-@contextlib.contextmanager
-def _static(network: QNetwork) -> Generator[None, None, None]:
-    """Fix which policies run, since an exported graph cannot decide it for each batch."""
-    if not isinstance(network.head, TokenHead):
-        yield
-        return
-    mixture = network.head.mixture
-    opened = [index + 1 for index, gate_V in enumerate(mixture.gate_NV) if bool(gate_V.any())]
-    mixture.always_run = (0, *opened)
-    try:
-        yield
-    finally:
-        mixture.always_run = None
+def driven_observations(agent: QAgent, scenario: str, seeds: Sequence[int]) -> np.ndarray:
+    """Return every observation (B, V, F) that the agent meets in one episode of each spawn seed."""
+    from rapid.simulator import make_vec
+
+    worlds: Any = make_vec(scenario, len(seeds), autoreset=False)
+    obs_WVF, _ = worlds.reset(seed=list(seeds))
+    met, running_W = [np.array(obs_WVF)], np.ones(len(seeds), np.bool_)
+    while running_W.any():
+        obs_WVF, _, terminated_W, truncated_W, _ = worlds.step(agent.act(met[-1]))
+        met.append(np.array(obs_WVF))
+        running_W &= ~(terminated_W | truncated_W)
+    worlds.close()
+    return np.concatenate(met)
 
 
-@contextlib.contextmanager
-def _quiet() -> Generator[None, None, None]:
-    """Keep the exporter's chatter off the terminal."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
+def latency(path: str | os.PathLike[str], obs_VF: np.ndarray, calls: int = 2_000) -> float:
+    """Return the median seconds of one decision at batch 1 on one thread, the array in and the action out."""
+    agent = OnnxAgent(path)
+    session, obs_BVF = agent.session, check_observations(obs_VF[None], agent.name)
+    inputs = {agent.input: obs_BVF.reshape(1, -1) if agent.flat else obs_BVF}
+    warm_up, seconds = 100, list[float]()
+    for _ in range(warm_up + calls):
+        start = time.perf_counter()
+        session.run([agent.output], inputs)[0].argmax()
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds[warm_up:]))
 
 
 def _import_onnxruntime() -> Any:

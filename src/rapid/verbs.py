@@ -153,6 +153,18 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write an agent as ONNX, compare the two on real observations, and time a decision."""
+
+    agent: Annotated[Positional[str], arg(metavar="AGENT")]
+    """Directory of the agent."""
+    out: str = ""
+    """The file; by default AGENT.onnx, beside the agent's directory."""
+    dataset: str = ""
+    """Dataset whose observations are compared; without it, those that the agent meets on 32 test spawns."""
+
+
+@dataclass(frozen=True)
 class Report:
     """Write the page of a run again."""
 
@@ -338,6 +350,28 @@ def _evaluate(options: Evaluate, config: Config) -> int:
     return 0
 
 
+def _export(options: Export, config: Config) -> int:
+    from rapid.data.dataset import load_dataset
+    from rapid.export import driven_observations, export_onnx, latency
+    from rapid.networks.agent import load_agent
+    from rapid.spawns import spawn_seeds
+
+    agent, folder = load_agent(options.agent), Path(options.agent)
+    out = options.out or f"{folder.resolve()}.onnx"
+    if options.dataset:
+        obs_BVF = load_dataset(options.dataset).transitions.obs_NVF
+    else:
+        scenario = str(agent.metadata.get("scenario") or config.scenario)
+        obs_BVF = driven_observations(agent, scenario, spawn_seeds("test", 32))
+    parity = export_onnx(agent, out, obs_BVF)
+    print(
+        f"{out}\n{parity.observations} observations: largest difference of Q-values {parity.difference:.2g}, "
+        f"the same action on {parity.agreement:.2%}\n"
+        f"one decision on one thread: {latency(out, obs_BVF[0]) * 1e6:.0f} microseconds (median)"
+    )
+    return 0
+
+
 def _report(options: Report, config: Config) -> int:
     from rapid import pipeline
 
@@ -391,6 +425,7 @@ _VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "distill": (Distill, _distill),
     "adapt": (Adapt, _adapt),
     "evaluate": (Evaluate, _evaluate),
+    "export": (Export, _export),
     "report": (Report, _report),
     "models": (Models, _models),
     "verify-simulator": (VerifySimulator, _verify),

@@ -52,9 +52,6 @@ class MixtureOfPolicies(nn.Module):
     Policy 1 is always among the K; the adapters compete for the other K-1 places.
     """
 
-    always_run: tuple[int, ...] | None = None
-    """Indices of the policies to run whatever the batch needs; None skips those that cannot matter."""
-
     def __init__(self, config: NetworkConfig, num_policies: int) -> None:
         super().__init__()
         self.top_k, self.gate_kind = min(config.top_k, num_policies), config.gate
@@ -96,8 +93,6 @@ class MixtureOfPolicies(nn.Module):
 
     def _runs(self, index: int, router_BVN: Tensor) -> bool:
         """Whether the policy can change the output or a gradient; if not, leaving it out changes no bit."""
-        if self.always_run is not None:
-            return index in self.always_run
         if index == 0:
             return True
         if self.top_k < len(self.policies) and not bool(router_BVN[..., index].any()):
