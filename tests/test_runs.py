@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +34,19 @@ def test_the_same_settings_go_on_and_others_are_refused(tmp_path: Path):
         RunDirectory(tmp_path, replace(config, seed=1), STEPS)
     assert "--directory" in str(error.value)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_where_it_runs_may_change_and_settings_may_be_added(tmp_path: Path):
+    config = preset("strong", "tiny")
+    RunDirectory(tmp_path, config, STEPS)
+    RunDirectory(tmp_path, replace(config, collect=replace(config.collect, workers=4)), STEPS)
+    manifest = json.loads((tmp_path / "run.json").read_text())
+    for name in ("shards", "max_decisions"):
+        del manifest["config"]["collect"][name]
+    (tmp_path / "run.json").write_text(json.dumps(manifest))
+    RunDirectory(tmp_path, config, STEPS)
+    with pytest.raises(RapidError, match=r"collect\.shards: 0 there, 2 now"):
+        RunDirectory(tmp_path, replace(config, collect=replace(config.collect, shards=2)), STEPS)
 
 
 def test_redoing_from_a_step_keeps_the_earlier_ones(tmp_path: Path):

@@ -17,6 +17,7 @@ VERBS: dict[str, str] = {
     "distill": "phase 2: offline RL with the robust term, into a policy",
     "adapt": "phase 3: online DQN in the target scenario, the distilled policy frozen",
     "evaluate": "drive policies and scripted drivers over fixed spawns, clean and attacked",
+    "teach-bench": "compare teachers, models and prompt styles on the same spawns",
     "export": "write an agent as ONNX, check it against the original, time it",
     "report": "write the page of a run again",
     "models": "list, fetch, verify and remove the embedded language models",

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 from tyro.conf import Positional, arg
@@ -26,6 +26,7 @@ from rapid.config import (
     TeacherConfig,
 )
 from rapid.errors import RapidError
+from rapid.scenarios import PAPER_SCENARIOS
 
 T = TypeVar("T")
 
@@ -150,6 +151,33 @@ class Evaluate:
     seed: int = Config.seed
     """Decides the noise of attacks and the random driver; the traffic is fixed by the spawn seeds."""
     source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class TeachBench:
+    """Compare teachers, models and prompt styles on the same spawns: what each is worth, what each costs.
+
+    The same command goes on after an interruption; with one more teacher it drives that one only.
+    """
+
+    teachers: Annotated[Positional[tuple[str, ...]], arg(metavar="TEACHER ...")]
+    """Scripted drivers (rule, rule-forecast, slower, random, ..., planner), embedded models with a style
+    (smollm2-135m:digest, smollm2-135m:react, and as a control smollm2-135m:digest:shuffled), or TOML files with a
+    [teacher] section, for servers and recordings. The others are compared with the first."""
+    scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = PAPER_SCENARIOS
+    """Where they drive; by default the paper's three."""
+    spawns: int = 32
+    """Episodes of each teacher in each scenario."""
+    spawn_set: Literal["tune", "test"] = "tune"
+    """Where the spawn seeds come from: `tune` to choose a teacher, `test` to report one that was chosen elsewhere."""
+    lockstep: int = 64
+    """Episodes driven side by side, so that a model sees a batch of prompts."""
+    out: str = "teach-bench"
+    """Directory of the rows, the table and the plot."""
+    simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
+    """The compiled twin, or highway-env itself."""
+    seed: int = Config.seed
+    """Decides the random drivers and the shuffled facts; the traffic is fixed by the spawn seeds."""
 
 
 @dataclass(frozen=True)
@@ -307,6 +335,8 @@ def _collect(options: Collect, config: Config) -> int:
     uniform = (config.teacher.backend, config.teacher.model) == ("scripted", "random")
     dataset = pipeline.collect_transitions(config, Path(options.out), "random" if uniform else "teacher")
     print(f"{len(dataset)} transitions in {options.out}")
+    if not (dataset.collection or {}).get("complete", True):
+        print("The budget is spent; the same command with a larger one goes on.", file=sys.stderr)
     return 0
 
 
@@ -346,6 +376,22 @@ def _evaluate(options: Evaluate, config: Config) -> int:
     from rapid import pipeline
 
     pipeline.compare(config, options.agents, Path(options.out))
+    print((Path(options.out) / "summary.txt").read_text(encoding="utf-8"))
+    return 0
+
+
+def _teach_bench(options: TeachBench, config: Config) -> int:
+    from rapid.teach_bench import compare_teachers
+
+    compare_teachers(
+        config,
+        options.teachers,
+        options.scenarios,
+        Path(options.out),
+        spawns=options.spawns,
+        spawn_set=options.spawn_set,
+        lockstep=options.lockstep,
+    )
     print((Path(options.out) / "summary.txt").read_text(encoding="utf-8"))
     return 0
 
@@ -425,6 +471,7 @@ _VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "distill": (Distill, _distill),
     "adapt": (Adapt, _adapt),
     "evaluate": (Evaluate, _evaluate),
+    "teach-bench": (TeachBench, _teach_bench),
     "export": (Export, _export),
     "report": (Report, _report),
     "models": (Models, _models),

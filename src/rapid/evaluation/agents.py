@@ -116,18 +116,19 @@ class _TeacherDriver:
 
     def __init__(self, teacher: Any, generator_seed: int) -> None:
         self._teacher, self._seed = teacher, generator_seed
-        self._previous: dict[int, Any] = {}
+        self.previous: dict[int, Any] = {}
+        """Each world's last decision."""
 
     def choose(
         self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64], seed_B: NDArray[np.int64], step: int
     ) -> NDArray[np.int64]:
         # A key names one decision, whatever else is asked beside it, so that a driver's chance does not depend on that.
         keys = [stream_seed(self._seed, f"decision/{seed_B[world]}/{step}") for world in worlds]
-        previous = [self._previous.get(int(world)) for world in worlds]
+        previous = [self.previous.get(int(world)) for world in worlds]
         decisions = self._teacher.decide(seen_BVF[worlds], previous, np.array(keys, np.int64))
         for world, decision in zip(worlds, decisions, strict=True):
-            self._previous[int(world)] = decision
+            self.previous[int(world)] = decision
         return np.array([int(decision.action) for decision in decisions], np.int64)
 
     def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
-        return [(None, str(getattr(self._previous[int(world)], "explanation", "") or "")) for world in worlds]
+        return [(None, str(getattr(self.previous[int(world)], "explanation", "") or "")) for world in worlds]

@@ -180,12 +180,12 @@ def summary_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
     blocks: list[str] = []
     for scenario in dict.fromkeys(row.scenario for row in summaries):
         here = [row for row in summaries if row.scenario == scenario]
-        blocks.append(f"{scenario}\n{_table(_clean_cells(here))}")
+        blocks.append(f"{scenario}\n{aligned(_clean_cells(here))}")
         if any(row.attacks for row in here):
             names = list(here[0].attacks)
             lines = [["return under attack", "none", *names]]
             lines += [[row.label, number(row.metrics["episode_return"].value), *_attack_texts(row)] for row in here]
-            blocks.append(_table(lines))
+            blocks.append(aligned(lines))
     if any(cell.missing == NOT_APPLICABLE for row in summaries for cell in row.attacks.values()):
         blocks.append(f"{NOT_APPLICABLE}: {NOT_APPLICABLE_WHY}")
     blocks.append(units(summaries))
@@ -218,7 +218,7 @@ def _clean_cells(rows: Sequence[SummaryRow]) -> list[list[str]]:
     return lines
 
 
-def _table(lines: Sequence[Sequence[str]]) -> str:
+def aligned(lines: Sequence[Sequence[str]]) -> str:
     """Return the lines aligned, names to the left, a rule under the head."""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     text = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]

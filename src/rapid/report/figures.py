@@ -1,4 +1,4 @@
-"""Pictures for a README, as PNG files beside the page."""
+"""Pictures for a README or a paper, as files beside the page."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,7 @@ from matplotlib.patches import FancyBboxPatch
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.statistics import Estimate
 from rapid.evaluation.summary import SummaryRow, label_of, summarize, units
+from rapid.evaluation.teacher_summary import TeacherSummary
 from rapid.files import atomic_path
 from rapid.report.curves import UNIFORM, series
 from rapid.report.data import Entries, ReportData, paper_return
@@ -40,8 +41,7 @@ def write_figures(run: ReportData, directory: str | os.PathLike[str]) -> list[Pa
         if figure is None:
             continue
         path = Path(directory) / name
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png", dpi=160, facecolor="white")
+        save_figure(figure, path)
         paths.append(path)
     return paths
 
@@ -99,6 +99,38 @@ def results_figure(rows: Sequence[SummaryRow], lead: str) -> Figure | None:
 def _whisker(axes: Axes, of: Estimate, y: float, scale: float, color: str) -> None:
     axes.plot([of.low * scale, of.high * scale], [y, y], color=color, linewidth=3, alpha=0.35, solid_capstyle="round")
     axes.plot(of.value * scale, y, "o", color=color, markersize=5)
+
+
+def teachers_figure(summaries: Sequence[TeacherSummary]) -> Figure:
+    """Return each teacher's return and crash share with their intervals, and its unsafe choices; a row a scenario."""
+    scenarios = list(dict.fromkeys(summary.scenario for summary in summaries))
+    groups = [[of for of in summaries if of.scenario == scenario][::-1] for scenario in scenarios]
+    figure = _figure(9.5, 0.8 + sum(0.75 + 0.34 * len(group) for group in groups))
+    grid = figure.subplots(len(groups), 3, squeeze=False, sharex="col", height_ratios=[1 + len(of) for of in groups])
+    for row, scenario, group in zip(grid, scenarios, groups, strict=True):
+        for y, of in enumerate(group):
+            color = _SOFT if of.return_difference is None else _ACCENT
+            _whisker(row[0], of.episode_return, y, 1.0, color)
+            _whisker(row[1], of.crashed, y, 100.0, color)
+            row[2].barh(y, of.unsafe_share * 100, 0.45, color=color)
+        for axes, title in zip(row, ("return", "crashed, %", "unsafe choices, %"), strict=True):
+            axes.set_title(f"{scenario}: {title}" if axes is row[0] else title, fontsize=10, loc="left")
+            axes.set_ylim(-0.6, len(group) - 0.4)
+            axes.set_yticks(range(len(group)), [of.teacher for of in group] if axes is row[0] else [""] * len(group))
+            for label in axes.get_yticklabels():
+                # A name is not ours: a dollar sign in it begins no formula.
+                label.set_parse_math(False)
+            _clean(axes)
+    for axes in grid[0]:
+        # Last, as it ends the fitting of the axis to what is drawn; it holds for the column.
+        axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure atomically, in the format that the path's suffix names (png, svg)."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=path.suffix.removeprefix("."), dpi=160, facecolor="white")
 
 
 def curves_figure(distill: Mapping[str, Entries], adapt: Mapping[str, Entries]) -> Figure | None:
