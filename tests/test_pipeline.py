@@ -138,6 +138,12 @@ def test_two_agents_of_one_name_stay_apart(config: Config, finished: Path, tmp_p
         ({"mix": {"p": 0.0}, "collect": {"teacher_transitions": 0}}, "collect.teacher_transitions"),
         ({"evaluate": {"attacks": ["pdg"]}}, "did you mean 'pgd'"),
         ({"device": "tpu"}, "--device cpu"),
+        ({"teacher": {"backend": "replay", "replay_file": "nowhere"}}, "There is no recording at 'nowhere'"),
+        ({"teacher": {"backend": "endpoint", "base_url": "nowhere"}}, "The address 'nowhere' cannot be used"),
+        ({"teacher": {"backend": "local", "model": "smollm"}}, "did you mean 'smollm2-135m'"),
+        ({"teacher": {"backend": "endpoint", "memory": "nowhere", "few_shot": 3}}, "There is no memory at 'nowhere'"),
+        ({"teacher": {"backend": "endpoint", "few_shot": 3}}, "no memory to take examples from"),
+        ({"teacher": {"few_shot": -1}}, "teacher.few_shot"),
     ],
 )
 def test_steps_that_cannot_follow_are_refused_before_any_work(

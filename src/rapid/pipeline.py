@@ -36,7 +36,7 @@ from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
 from rapid.simulator import make_vec
 from rapid.spawns import TrainPart, spawn_seeds
-from rapid.teacher import Teacher, make_teacher, models
+from rapid.teacher import Teacher, check_teacher, make_teacher
 from rapid.training.offline import distill
 from rapid.training.online import adapt
 from rapid.training.record import load_metrics
@@ -136,10 +136,7 @@ def check(config: Config) -> None:
         get_attack(name, lanes)
     parse_shard(config.collect.shard)
     check_engine(config.collect.engine)
-    if config.teacher.backend == "scripted":
-        make_teacher(config.teacher, lanes)
-    elif config.teacher.backend == "local":
-        models.is_present(config.teacher.model)
+    check_teacher(config.teacher, lanes)
 
 
 def _check_whole(config: Config) -> None:

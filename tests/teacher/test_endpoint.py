@@ -2,94 +2,19 @@
 
 import json
 import math
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from fake_server import Server, answer, completion, drop, hang, refuse
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.teacher import from_record, make_teacher, to_record
 from rapid.teacher.conversation import ChatError, ConversingTeacher
 from rapid.teacher.endpoint import Endpoint
 
-KEEP = '{"explanation": "calm road", "action": "keep"}'
 SECRET = "sk-planted-0123456789"
-
-
-def completion(text: str | None = KEEP, logprobs: object = None, **message) -> dict:
-    return {
-        "id": "1",
-        "object": "chat.completion",
-        "created": 1,
-        "model": "m",
-        "choices": [
-            {
-                "index": 0,
-                "finish_reason": "stop",
-                "message": {"role": "assistant", "content": text, **message},
-                "logprobs": logprobs,
-            }
-        ],
-        "usage": {"prompt_tokens": 11, "completion_tokens": 7, "total_tokens": 18},
-    }
-
-
-class Server:
-    """Plays a list of acts, one per request, the last one for ever; an act gets the handler and the request."""
-
-    def __init__(self) -> None:
-        self.acts: list = [answer(completion())]
-        self.requests: list[dict] = []
-        self.authorization: list[str | None] = []
-        server = self
-
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def do_POST(self) -> None:
-                request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-                server.requests.append(request)
-                server.authorization.append(self.headers["Authorization"])
-                act = server.acts.pop(0) if len(server.acts) > 1 else server.acts[0]
-                act(self, request)
-
-            def log_message(self, *args) -> None:
-                pass
-
-        self.http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.http.daemon_threads = True
-        threading.Thread(target=self.http.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
-        self.url = f"http://127.0.0.1:{self.http.server_port}/v1"
-
-
-def answer(body, status=200, headers=None):
-    def act(handler, request) -> None:
-        content = body.encode() if isinstance(body, str) else json.dumps(body).encode()
-        handler.send_response(status)
-        for name, value in {"Content-Type": "application/json", **(headers or {})}.items():
-            handler.send_header(name, value)
-        handler.send_header("Content-Length", str(len(content)))
-        handler.end_headers()
-        handler.wfile.write(content)
-
-    return act
-
-
-def drop(handler, request) -> None:
-    handler.close_connection = True
-    handler.connection.close()
-
-
-def hang(handler, request) -> None:
-    time.sleep(1.0)
-    drop(handler, request)
-
-
-def refuse(status, text="no", **headers):
-    return answer({"error": {"message": text}}, status, headers)
 
 
 @pytest.fixture
@@ -99,8 +24,7 @@ def server(monkeypatch) -> Iterator[Server]:
     monkeypatch.setenv("RAPID_TEST_KEY", SECRET)
     server = Server()
     yield server
-    server.http.shutdown()
-    server.http.server_close()
+    server.close()
 
 
 def settings(server, **changes) -> TeacherConfig:

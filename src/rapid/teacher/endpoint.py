@@ -6,6 +6,7 @@ tools) is found out by its refusal and left out from then on.
 """
 
 import json
+import logging
 import math
 import os
 import random
@@ -54,6 +55,9 @@ class Endpoint:
             )
         except (openai.OpenAIError, ValueError) as error:
             raise RapidError(f"The address '{config.base_url}' cannot be used: {self._clean(error)}.") from None
+        # Their debug log holds every header of a response, where a server may repeat the key.
+        for transport in ("httpcore", "httpcore2"):
+            logging.getLogger(transport).setLevel(logging.INFO)
         self._tools = config.tool_calling != "text"
         self._schema = self._logprobs = True
         self._lock = threading.Lock()
