@@ -1,7 +1,8 @@
 """``rapid teach-bench``: several teachers on the same spawn seeds, what each is worth and what each costs.
 
-What a teacher did in a scenario is kept under the hash of all that decides it, so the same command goes on after an
-interruption, and a command with one more teacher drives that one only.
+What a teacher did in a scenario is kept under the hash of its settings, its prompts and its spawns, so the same command
+goes on after an interruption, and a command with one more teacher drives that one only. After a change of the code that
+those do not show, choose another directory; each row tells the commit that measured it.
 """
 
 import hashlib
