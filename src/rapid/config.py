@@ -303,6 +303,8 @@ class Config:
     """Torch threads of this process; scale by processes instead."""
     device: str = "cpu"
     """Torch device."""
+    tracking: Literal["none", "tensorboard", "wandb", "trackio"] = "none"
+    """Where the metrics of both trainings are copied to; offline unless WANDB_MODE says otherwise."""
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
     """Phase 1: the teacher."""
     collect: CollectConfig = field(default_factory=CollectConfig)
@@ -389,7 +391,7 @@ def _resize(config: Config) -> Config:
 
 def without_place(config: Config) -> Config:
     """Return `config` with the settings at their defaults that say where and how fast it is computed, not what."""
-    return replace(config, threads=1, collect=replace(config.collect, engine="local", workers=1))
+    return replace(config, threads=1, tracking="none", collect=replace(config.collect, engine="local", workers=1))
 
 
 def to_dict(config: Any) -> dict[str, Any]:

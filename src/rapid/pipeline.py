@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from rapid.attacks import get_attack
-from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict, validate
+from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict, validate, without_place
 from rapid.data.collection import Budget, collect, parse_shard
 from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
 from rapid.data.journal import exclusive
@@ -37,6 +37,7 @@ from rapid.seeding import stream_seed
 from rapid.simulator import make_vec
 from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import Teacher, check_teacher, make_teacher
+from rapid.tracking import Tracker, check_tracking
 from rapid.training.offline import distill
 from rapid.training.online import adapt
 from rapid.training.record import load_metrics
@@ -136,6 +137,7 @@ def check(config: Config) -> None:
         get_attack(name, lanes)
     parse_shard(config.collect.shard)
     check_engine(config.collect.engine)
+    check_tracking(config.tracking)
     check_teacher(config.teacher, lanes)
 
 
@@ -262,7 +264,8 @@ def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled"
     network = build_network(
         config.network, get_scenario(dataset.scenario).lanes, stream_seed(config.seed, "network")
     ).to(config.device)
-    with task(f"distill, {name}", config.distill.iterations, "iterations") as work:
+    tracker = Tracker(config.tracking, out, f"distill-{name}".replace(" ", "-"), to_dict(without_place(config)))
+    with tracker, task(f"distill, {name}", config.distill.iterations, "iterations") as work:
         distill(
             dataset.transitions,
             network,
@@ -272,6 +275,7 @@ def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled"
             evaluate=_curve(config, dataset.scenario, name),
             progress=work,
             teacher_share=dataset.teacher_share,
+            track=tracker.log,
         )
     metadata = {"name": name, "phase": "distill", "data": str(data), "scenario": dataset.scenario, "seed": config.seed}
     save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
@@ -304,7 +308,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     distilled = load_agent(agent, config.device)
     scenario = config.adapt.scenario or distilled.metadata.get("scenario", config.scenario)
     settings = config.adapt if data else replace(config.adapt, offline_share=0.0)
-    with task(f"adapt, {name}", settings.steps, "steps") as work:
+    tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
+    with tracker, task(f"adapt, {name}", settings.steps, "steps") as work:
         network = adapt(
             distilled.network,
             settings,
@@ -315,6 +320,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
             evaluate=_curve(config, scenario, name),
             progress=work,
             make_worlds=lambda count: make_vec(scenario, count, simulator=config.simulator),
+            track=tracker.log,
         )
     metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
     save_agent(out / "agent", network, metadata | {"config": to_dict(config)})

@@ -27,6 +27,7 @@ from rapid.config import (
 )
 from rapid.errors import RapidError
 from rapid.scenarios import PAPER_SCENARIOS
+from rapid.tracking import Tracking
 
 T = TypeVar("T")
 
@@ -111,6 +112,8 @@ class Distill:
     """Directory of the agent and its training record."""
     curve_spawns: int = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
+    tracking: Tracking = Config.tracking
+    """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""
     seed: int = Config.seed
     """Decides the weights, the batches and the inner attack."""
     source: Flat[Source] = field(default_factory=Source)
@@ -129,6 +132,8 @@ class Adapt:
     """Directory of the adapted agent and its training record."""
     curve_spawns: int = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
+    tracking: Tracking = Config.tracking
+    """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""
     seed: int = Config.seed
     """Decides the traffic, the exploration and the batches."""
     source: Flat[Source] = field(default_factory=Source)

@@ -17,7 +17,7 @@ from rapid.networks.q_network import QNetwork, set_phase
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, torch_stream
 from rapid.training.learner import Learner
-from rapid.training.record import Evaluate, Record, crossed, fingerprint, network_fingerprint
+from rapid.training.record import Evaluate, Record, Track, crossed, fingerprint, network_fingerprint
 
 LOG_EVERY = 100
 
@@ -33,6 +33,7 @@ def distill(
     *,
     teacher_share: float | None = None,
     checkpoint_seconds: float = 60.0,
+    track: Track | None = None,
 ) -> QNetwork:
     """Train `network` in place on a fixed dataset and return it; the same call goes on from the last checkpoint.
 
@@ -46,6 +47,7 @@ def distill(
         progress: counts iterations.
         teacher_share: see `Dataset.teacher_share`.
         checkpoint_seconds: time between two checkpoints.
+        track: is given every row of metrics.
 
     Raises:
         RapidError: an empty dataset, one without what the loss needs, a loss that is not finite (the last good
@@ -66,6 +68,7 @@ def distill(
             "seed": seed,
         },
         checkpoint_seconds,
+        track,
     )
     sampler = OfflineSampler(transitions, config.loss.discount, config.loss.n_step, device, teacher_share)
     rng = numpy_stream(seed, "distill/batches")

@@ -15,7 +15,7 @@ from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import Learner
 from rapid.training.offline import check_labels, data_fingerprint
-from rapid.training.record import Evaluate, Record, crossed, network_fingerprint
+from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
 from rapid.training.worlds import Drive, MakeWorlds, epsilon_greedy
 
 LOG_EVERY = 1_000
@@ -34,6 +34,7 @@ def adapt(
     *,
     make_worlds: MakeWorlds | None = None,
     checkpoint_seconds: float = 60.0,
+    track: Track | None = None,
 ) -> QNetwork:
     """Train `network` in place by driving and return it; the same call goes on from the last checkpoint.
 
@@ -48,6 +49,7 @@ def adapt(
         progress: counts environment steps.
         make_worlds: gives a vector environment of so many worlds with SAME_STEP autoreset; None is `rapid.make_vec`.
         checkpoint_seconds: time between two checkpoints.
+        track: is given every row of metrics.
 
     Raises:
         RapidError: settings that do not fit the data, a loss that is not finite (the last good checkpoint stays), or a
@@ -67,6 +69,7 @@ def adapt(
             "seed": seed,
         },
         checkpoint_seconds,
+        track,
     )
     forgetting = Forgetting(network, offline, seed)
     if config.train == "scratch":

@@ -21,6 +21,9 @@ METRICS_FILE, CHECKPOINT_FILE = "metrics.jsonl", "checkpoint.safetensors"
 Evaluate = Callable[[QNetwork, int], dict[str, Any]]
 """Measures a network: (network, iterations or environment steps so far) -> numbers, or anything that JSON holds."""
 
+Track = Callable[[dict[str, Any]], None]
+"""Takes a row of metrics, as JSON holds it, to show it elsewhere."""
+
 
 class Record:
     """The metrics and the checkpoint of one training.
@@ -29,10 +32,15 @@ class Record:
         directory: made if need be.
         settings: what makes this training this one; a checkpoint of another is refused.
         every_seconds: time between two checkpoints. When they are taken has no influence on the result.
+        track: is given every row, and again the earlier ones when the training goes on.
     """
 
     def __init__(
-        self, directory: str | os.PathLike[str], settings: dict[str, Any], every_seconds: float = 60.0
+        self,
+        directory: str | os.PathLike[str],
+        settings: dict[str, Any],
+        every_seconds: float = 60.0,
+        track: Track | None = None,
     ) -> None:
         self.directory = Path(directory)
         try:
@@ -41,7 +49,7 @@ class Record:
             raise RapidError(f"Cannot train in '{directory}': {error}. Choose a directory you can write to.") from error
         # As JSON gives it back, so that the comparison sees no tuples.
         self._settings: dict[str, Any] = json.loads(json.dumps(settings))
-        self._every = every_seconds
+        self._every, self._track = every_seconds, track
         self._seconds_before = 0.0
         self._start = self._last = time.monotonic()
 
@@ -74,14 +82,20 @@ class Record:
                     f"'{metrics}' was cut off or removed. Restore it, or delete the directory to start anew."
                 )
             os.truncate(metrics, state["metrics_bytes"])
+            if self._track:
+                for row in load_metrics(self.directory):
+                    self._track(row)
         else:
             metrics.unlink(missing_ok=True)
         return state["state"]
 
     def write(self, row: dict[str, Any]) -> None:
         """Append one line of metrics; NaN and infinity become null."""
+        row = _finite(row)
         with (self.directory / METRICS_FILE).open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(_finite(row), allow_nan=False) + "\n")
+            stream.write(json.dumps(row, allow_nan=False) + "\n")
+        if self._track:
+            self._track(row)
 
     def checkpoint(self, state: Callable[[], dict[str, Any]], now: bool = False) -> None:
         """Save what `state` returns if it is time, or `now`."""
