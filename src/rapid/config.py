@@ -37,7 +37,7 @@ class TeacherConfig:
     recorded answers, `scripted` needs no model."""
     model: str = "smollm2-135m"
     """Name of the model (`rapid models list`), of the server's model, or of the scripted driver
-    (random, idle, slower, faster, rule, rule-forecast, uniform-safe)."""
+    (random, idle, slower, faster, rule, rule-forecast, rule-foresight, uniform-safe)."""
     style: Literal["digest", "react"] = "digest"
     """`digest` inlines every tool result and asks for one decision; `react` lets the model call the tools in turns."""
     base_url: str = "http://127.0.0.1:8000/v1"

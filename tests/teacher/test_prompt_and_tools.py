@@ -8,7 +8,7 @@ from rapid.scenarios import ACTIONS, FASTER, IDLE
 from rapid.teacher.briefing import briefing, read_call, read_choice
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import gather
-from rapid.teacher.prompt import WORDS, content_free, digest, digest_system, prompt_version
+from rapid.teacher.prompt import WORDS, calibration, digest, digest_system, prompt_version
 from rapid.teacher.scene import read_scenes
 from rapid.teacher.tools import TOOL_NAMES, action_named, call_tool, tool_help, tool_specifications
 
@@ -24,18 +24,26 @@ def test_the_digest_offers_every_possible_action_once(crowd):
         prompt = digest(facts)
         words = [word.strip(" .") for part in prompt.user.split(":")[1:] for word in part.split(".")[0].split(",")]
         assert sorted(set(words) - {"none"}) == sorted(WORDS[action] for action in facts.available)
-        assert prompt.system == digest_system(3) == content_free(3).system
+        assert prompt.system == digest_system(3)
 
 
-def test_the_digest_calls_safe_what_the_facts_call_safe(crowd):
+def test_the_digest_sorts_actions_as_the_facts_do(crowd):
     for scene in read_scenes(crowd, 3):
         facts = gather(scene)
-        named = digest(facts).user.split(". ")[0]
-        if named.startswith("Safe"):
-            for action in facts.available:
-                assert (WORDS[action] in named) == facts.safe(action)
-        else:
-            assert not any(facts.safe(action) for action in facts.available)
+        safe, tight, unsafe = (part.split(": ")[1] for part in digest(facts).user.rstrip(".").split(". "))
+        for action in facts.available:
+            if facts.is_open(action):
+                assert WORDS[action] in (safe if facts.survives(action) else tight)
+            else:
+                assert WORDS[action] in (tight if facts.survives(action) else unsafe)
+
+
+def test_calibration_names_every_action_in_every_place():
+    prompts = calibration(3)
+    assert {prompt.system for prompt in prompts} == {digest_system(3)}
+    for word in WORDS.values():
+        assert sum(word in prompt.user.split(".")[0] for prompt in prompts) == 1
+        assert all(prompt.user.count(word) == 1 for prompt in prompts)
 
 
 def test_the_prompt_version_follows_the_road(facts):
@@ -60,7 +68,7 @@ def test_tools_answer_from_the_facts(facts):
     assert "car 2: lane 2, 25.0 m ahead, 20.0 m/s" in call_tool(facts, "cars_on_lane", '{"lane": 2}')
     assert "in conflict with car 2" in call_tool(facts, "check_action", '{"action": "faster"}')
     assert call_tool(facts, "check_action", '{"action": "slower"}') == "slower: by distance and speed safe."
-    assert call_tool(facts, "forecast_action", '{"action": "keep"}').startswith("keep: in the next 4 s")
+    assert call_tool(facts, "forecast_action", '{"action": "keep"}').startswith("keep: tight")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Scene, facts and forecast: what follows from an observation, and that nothing in it can break them."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ from rapid.errors import RapidError
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from rapid.teacher.facts import MINIMUM_GAP, check, gather, safest
 from rapid.teacher.forecast import NO_CAR
+from rapid.teacher.foresight import DEPTH
 from rapid.teacher.prompt import digest
 from rapid.teacher.scene import read_scenes
 
@@ -85,7 +87,6 @@ def test_the_forecast_sees_a_wall_of_standing_cars(world):
     facts = gather(scene_of(world(speed=24, cars=((30, 0, 0), (30, 1, 0), (30, 2, 0)))))
     assert not any(facts.safe(action) for action in facts.available)
     assert facts.forecasts[FASTER].hold_crash <= facts.forecasts[IDLE].hold_crash <= 2
-    assert safest(facts) == SLOWER
 
 
 def test_the_forecast_sees_a_car_beside(world):
@@ -106,6 +107,39 @@ def test_braking_never_leaves_less_room_to_a_slower_car_ahead(world):
         for future in gather(scene_of(world(cars=((gap, 1, 18),)))).forecasts:
             assert future.brake_gap >= future.hold_gap
             assert future.brake_crash >= future.hold_crash
+
+
+def test_on_an_empty_road_nothing_crashes_and_faster_goes_farther(world):
+    ways = gather(scene_of(world(speed=20))).ways
+    assert all(way.seconds == DEPTH for way in ways)
+    assert ways[FASTER].distance > ways[IDLE].distance > ways[SLOWER].distance
+    assert ways[FASTER].value > ways[SLOWER].value
+
+
+def test_foresight_sees_a_wall_that_braking_does_not_avoid(world):
+    facts = gather(scene_of(world(speed=28, cars=((30, 0, 0), (30, 1, 0), (30, 2, 0)))))
+    assert not any(facts.survives(action) for action in facts.available)
+    assert facts.is_open(safest(facts))
+
+
+def test_foresight_sees_a_car_beside(world):
+    facts = gather(scene_of(world(cars=((1, 0, 24),))))
+    assert facts.ways[LANE_LEFT].seconds == 0
+    assert facts.survives(LANE_RIGHT)
+
+
+def test_unseen_traffic_is_feared_where_the_observation_is_full(world):
+    cars = tuple((-6.0 - 2.5 * i, i % 3, 20.0) for i in range(14))
+    full, one_less = (gather(scene_of(world(speed=28, cars=part))) for part in (cars, cars[1:]))
+    assert full.ways[IDLE].value < one_less.ways[IDLE].value
+
+
+def test_shuffled_facts_are_told_of_other_actions(world):
+    facts = gather(scene_of(world(cars=((20, 1, 10),))))
+    told = (2, 0, 1, 4, 3)
+    shuffled = dataclasses.replace(facts, told=told)
+    assert shuffled.ways == tuple(facts.ways[action] for action in told)
+    assert shuffled.forecasts == tuple(facts.forecasts[action] for action in told)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -28,6 +28,7 @@ _SHOWN = {
     "uniform-safe": "random among safe",
     "rule": "rule",
     "rule-forecast": "rule, forecast",
+    "rule-foresight": "rule, foresight",
 }
 
 CLEAN = "none"

@@ -46,7 +46,7 @@ class TeacherSummary:
     repaired_share: float
     fallback_share: float
     unlike_rule_share: float
-    """Of decisions, those that differ from what the forecast rule takes in the same scene."""
+    """Of decisions, those that differ from what `rule-foresight` takes in the same scene."""
     decisions_per_second: float
     tokens: float
     """Read and written, an episode."""
@@ -205,7 +205,7 @@ def _notes(summaries: Sequence[TeacherSummary]) -> str:
     return (
         f"Means over {spawns} spawn seeds, with 95 % bootstrap intervals; differences are to {first}, paired by spawn "
         "(crashes in percentage points). unsafe: choices that the forecast calls unsafe, of those where something safe "
-        "was available. unlike rule: choices other than the forecast rule's in the same scene. flaps: lane changes "
+        "was available. unlike rule: choices other than rule-foresight's in the same scene. flaps: lane changes "
         f"undone within {FLAP_WITHIN} decisions, per {EPISODE}. TTC: time to collision. headway: time to reach where "
         f"the car ahead is, each at most {LONGEST_HEADWAY:g} s. repaired: invalid answers put right on a second try; "
         "fallback: those that the rule replaced. tokens and cost: an episode."

@@ -74,7 +74,7 @@ class TeacherRow:
     headway: float
     """Mean time headway over those, s, bumper to bumper; each at most `LONGEST_HEADWAY`."""
     unlike_rule: int
-    """Choices that differ from what the forecast rule takes in the same scene."""
+    """Choices that differ from what the rule with the same foresight (`rule-foresight`) takes in the same scene."""
     repaired: int
     """Answers that were invalid and put right on a second try."""
     fallbacks: int
@@ -214,15 +214,15 @@ def judge(recording: Recording, lanes: int) -> dict[str, Any]:
     """Return the fields of a row that follow from the observations and the actions of an episode."""
     before_TVF, after_TVF, actions = recording.obs_TVF[:-1], recording.obs_TVF[1:], recording.action_T.tolist()
     all_facts = [gather(scene) for scene in read_scenes(before_TVF, lanes)]
-    rule = Scripted("rule-forecast", lanes, 0).decide(before_TVF, [None] * len(actions))
-    had_safe = [any(map(facts.safe, facts.available)) for facts in all_facts]
+    rule = Scripted("rule-foresight", lanes, 0).decide(before_TVF, [None] * len(actions))
+    had_safe = [any(map(facts.survives, facts.available)) for facts in all_facts]
     headways = time_headway(after_TVF)
     seen = headways[~np.isnan(headways)]
     changes = _lane_changes(all_facts, actions)
     return {
         "had_safe": sum(had_safe),
         "unsafe": sum(
-            had and not facts.safe(action) for had, facts, action in zip(had_safe, all_facts, actions, strict=True)
+            had and not facts.survives(action) for had, facts, action in zip(had_safe, all_facts, actions, strict=True)
         ),
         "lane_changes": len(changes),
         "flaps": count_flaps(changes),

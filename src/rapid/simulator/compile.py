@@ -17,9 +17,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @cache
 def kernel_stamp() -> bytes:
-    """Return a digest of every file of this package that holds a kernel."""
+    """Return a digest of every file of RAPID that holds a kernel."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         source = path.read_bytes()
         if b"@kernel" in source:
             digest.update(path.name.encode() + b"\0" + source)
@@ -30,9 +30,9 @@ def kernel(function: Function) -> Function:
     """Compile `function` with numba on its first call and keep the machine code on disk.
 
     Numba stamps a cached function with the content of its own file only, although the functions that it calls are
-    compiled into it; an edit of a callee would leave the caller stale. Here the stamp covers all kernels of the
-    package. The cache lies in ``NUMBA_CACHE_DIR`` if that is set, else beside the package, else (a read-only
-    installation) in the user's cache directory; where none of them can be written, kernels are compiled per process.
+    compiled into it; an edit of a callee would leave the caller stale. Here the stamp covers all kernels. The cache
+    lies in ``NUMBA_CACHE_DIR`` if that is set, else beside the package, else (a read-only installation) in the user's
+    cache directory; where none of them can be written, kernels are compiled per process.
 
     No fast-math: reassociated sums would change decisions that sit on a threshold, and runs would not be bit-identical.
     """

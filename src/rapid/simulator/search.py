@@ -66,7 +66,7 @@ def _commanded(cars, tags, world, action, settings):
 
 
 @kernel
-def _distinct(cars, tags, world, tries, settings, found):
+def distinct(cars, tags, world, tries, settings, found):
     """Write those of the actions `tries` that command different things into `found` and return how many they are."""
     lanes = np.empty(len(tries), np.int64)
     speeds = np.empty(len(tries))
@@ -83,7 +83,7 @@ def _distinct(cars, tags, world, tries, settings, found):
 
 
 @kernel
-def _select(returns, kinds, alive, counts, beam):
+def select(returns, kinds, alive, counts, beam):
     """Write the nodes to go on from into `beam` and return how many they are.
 
     If they are too many: the best of each kind, then the next best of each kind, then the next two, and so on, the
@@ -149,7 +149,7 @@ def search_world(cars, tags, world, tries, settings, width, depth, plan):
         node = 0
         for parent in beam[:kept]:
             old_cars, old_tags, old_world = all_cars[now, parent], all_tags[now, parent], all_world[now, parent]
-            for k in range(_distinct(old_cars, old_tags, old_world, tries, settings, found)):
+            for k in range(distinct(old_cars, old_tags, old_world, tries, settings, found)):
                 new_cars, new_tags, new_world = all_cars[then, node], all_tags[then, node], all_world[then, node]
                 new_cars[:], new_tags[:], new_world[:] = old_cars, old_tags, old_world
                 action = settings.actions[found[k]]
@@ -164,7 +164,7 @@ def search_world(cars, tags, world, tries, settings, width, depth, plan):
                 if (not alive[node] or t == depth - 1) and total > best:
                     best, best_length, best_node = total, t + 1, node
                 node += 1
-        kept = _select(all_returns[then, :node], kinds[:node], alive[:node], counts, beam)
+        kept = select(all_returns[then, :node], kinds[:node], alive[:node], counts, beam)
         if kept == 0:
             break
     node = best_node
@@ -191,7 +191,7 @@ def can_avoid_crash(cars, tags, world, tries, settings, depth):
     left = np.zeros(depth, np.int64)
     info = np.empty(INFO_COLUMNS)
     all_cars[0], all_tags[0], all_world[0] = cars, tags, world
-    left[0] = _distinct(all_cars[0], all_tags[0], all_world[0], tries, settings, found[0])
+    left[0] = distinct(all_cars[0], all_tags[0], all_world[0], tries, settings, found[0])
     t = 0
     while t >= 0:
         if left[t] == 0:
@@ -207,7 +207,7 @@ def can_avoid_crash(cars, tags, world, tries, settings, depth):
         t += 1
         if t == depth or terminated or truncated:
             return True
-        left[t] = _distinct(new_cars, new_tags, new_world, tries, settings, found[t])
+        left[t] = distinct(new_cars, new_tags, new_world, tries, settings, found[t])
     return False
 
 

@@ -15,7 +15,7 @@ from rapid.scenarios import NUM_ACTIONS
 from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision, Teacher
 from rapid.teacher.facts import Facts, gather
-from rapid.teacher.prompt import ANSWER_START, WORDS, content_free, digest, outcome, prompt_version
+from rapid.teacher.prompt import ANSWER_START, WORDS, calibration, digest, outcome, prompt_version
 from rapid.teacher.scene import read_scenes
 
 _VOCABULARY = [WORDS[action] for action in range(NUM_ACTIONS)]
@@ -34,9 +34,9 @@ class Scorer(Protocol):
 class ScoringTeacher:
     """Digest style with a model that scores: the likeliest available word is the decision, the rest the soft label.
 
-    Small models lean towards some words whatever they are told, so the score that a word has under a prompt without
-    content is subtracted first. With a `shuffle_seed`, the facts of the available actions change places: the control
-    that shows whether the model uses what it is told.
+    Small models lean towards some words whatever they are told, so the mean score that a word has over prompts which
+    name every action alike is subtracted first. With a `shuffle_seed`, the facts of the available actions change
+    places: the control that shows whether the model uses what it is told.
     """
 
     def __init__(self, model: Scorer, identity: dict[str, Any], lanes: int, shuffle_seed: int | None = None) -> None:
@@ -96,8 +96,9 @@ class ScoringTeacher:
     def _leaning(self) -> NDArray[np.float64]:
         if self._leaning_A is not None:
             return self._leaning_A
-        neutral = content_free(self._lanes)
-        leaning_A = self._model.score(neutral.system, [neutral.user], ANSWER_START, _VOCABULARY)[0][0]
+        prompts = calibration(self._lanes)
+        users = [prompt.user for prompt in prompts]
+        leaning_A = self._model.score(prompts[0].system, users, ANSWER_START, _VOCABULARY)[0].mean(0)
         self._leaning_A = leaning_A
         return leaning_A
 
@@ -107,9 +108,7 @@ def _shuffled(facts: Facts, key: tuple[int, int]) -> Facts:
     dealt = np.arange(NUM_ACTIONS)
     available = list(facts.available)
     dealt[available] = np.random.default_rng((key[0], key[1] & (2**64 - 1))).permutation(available)
-    return dataclasses.replace(
-        facts, checks=tuple(facts.checks[i] for i in dealt), forecasts=tuple(facts.forecasts[i] for i in dealt)
-    )
+    return dataclasses.replace(facts, told=tuple(dealt.tolist()))
 
 
 def softmax_over(scores_A: NDArray[np.float64], available: Sequence[int]) -> NDArray[np.float64]:

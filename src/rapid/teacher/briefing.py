@@ -82,7 +82,7 @@ def briefing(
     if previous:
         lines.append(f"Your previous decision: {WORDS[previous.action]}. {previous.explanation}".rstrip())
     if style == "digest":
-        lines.append("What each action leads to in the next 4 s:")
+        lines.append("What each action leads to:")
         lines += [f"{WORDS[action]}: {outcome(facts, action)}" for action in facts.available]
     return Prompt(system, "\n".join(lines))
 

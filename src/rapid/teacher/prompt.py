@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
-from rapid.teacher.facts import MINIMUM_GAP, TIGHT_GAP, Facts
+from rapid.teacher.facts import MINIMUM_GAP, OPEN_MARGIN, TIGHT_GAP, Facts
 from rapid.teacher.forecast import HORIZON, NO_CAR
+from rapid.teacher.foresight import CAUTION, DEPTH
 
 WORDS = {LANE_LEFT: "left", IDLE: "keep", LANE_RIGHT: "right", FASTER: "faster", SLOWER: "slower"}
 """The word for each action; short, and one token each for the models in the registry."""
@@ -41,28 +42,32 @@ class Prompt:
 def digest(facts: Facts) -> Prompt:
     """Return the prompt with all facts inlined and one decision asked for."""
     offered = [action for action in _ORDER if action in facts.available]
-    good = [action for action in offered if facts.safe(action)]
-    label = "Safe"
-    if not good:
-        # Nothing is safe: then it matters where there is most room, and the lists say so by their order.
-        offered.sort(key=facts.room, reverse=True)
-        good = [action for action in offered if facts.avoidable(action)]
-        label = "Risky"
-    bad = _listed([action for action in offered if action not in good])
-    user = f"{label}: {_listed(good)}. Unsafe: {bad}." if good else f"Unsafe: {bad}."
-    return Prompt(digest_system(facts.scene.lanes), user)
+    best = [action for action in offered if facts.is_open(action)]
+    rest = [action for action in offered if action not in best]
+    unsafe = [action for action in rest if not facts.survives(action)]
+    tight = [action for action in rest if action not in unsafe]
+    if not facts.survives(best[0]):
+        # A crash is foreseen whatever one does: what puts it off longest is not safe, but not like the rest either.
+        best, tight = [], best
+    return Prompt(digest_system(facts.scene.lanes), _sorted_out(best, tight, unsafe))
 
 
-def content_free(lanes: int) -> Prompt:
-    """Return the digest prompt without content; a model's leaning towards a word is measured on it."""
-    return Prompt(digest_system(lanes), "Safe: ?. Unsafe: ?.")
+def calibration(lanes: int) -> list[Prompt]:
+    """Return prompts that name every action in every place once; a model's leaning is its mean score over them.
+
+    One prompt with "?" for the actions measures something else: how likely the words are where none is named. With it
+    SmolLM2 chose an unsafe action in 6 of 100 prompts, with these in 1.
+    """
+    places = [([action], [], [other for other in _ORDER if other != action]) for action in _ORDER]
+    return [Prompt(digest_system(lanes), _sorted_out(*place)) for place in places]
 
 
 def digest_system(lanes: int) -> str:
     """Return the constant part of the digest style."""
     return (
         f"You drive a car on a highway with {lanes} lanes. Each second you choose one action: left, keep, right, "
-        "faster or slower. Never choose an unsafe action. Prefer right, then faster, then keep. Answer with one word."
+        "faster or slower. Never choose a tight or an unsafe action. Prefer right, then faster, then keep. "
+        "Answer with one word."
     )
 
 
@@ -70,20 +75,27 @@ def outcome(facts: Facts, action: int) -> str:
     """Return in a few words what an action leads to."""
     if action not in facts.available:
         return "not possible"
-    future = facts.forecasts[action]
-    if future.brake_gap == 0:
-        return f"unsafe, a crash in {future.brake_crash:.0f} s even when braking"
+    way, future = facts.ways[action], facts.forecasts[action]
+    if way.seconds < DEPTH:
+        return f"unsafe, a crash after {way.seconds:.0f} s whatever follows"
+    verdict = "safe" if facts.is_open(action) else "tight: others lead on with more room or speed"
     if future.hold_crash != float("inf"):
-        return f"unsafe, a crash in {future.hold_crash:.0f} s unless braking"
-    verdict = "safe" if facts.safe(action) else "unsafe"
-    gap = future.hold_gap
-    return f"{verdict}, free road" if gap >= NO_CAR else f"{verdict}, smallest gap {gap:.0f} m"
+        gap = f"a crash in {future.hold_crash:.0f} s unless braking or changing lane"
+    else:
+        gap = "free road" if future.hold_gap >= NO_CAR else f"smallest gap {future.hold_gap:.0f} m at this speed"
+    return f"{verdict}, {way.distance:.0f} m in {way.seconds:.0f} s, {gap}"
 
 
 def prompt_version(lanes: int) -> str:
     """Return a hash of everything that shapes the prompts; it changes when wording or thresholds do."""
-    text = (content_free(lanes), WORDS, ANSWER_START, _ORDER, MINIMUM_GAP, TIGHT_GAP, HORIZON)
+    wording = tuple(prompt.user for prompt in calibration(lanes))
+    numbers = (MINIMUM_GAP, TIGHT_GAP, HORIZON, OPEN_MARGIN, DEPTH, CAUTION)
+    text = (digest_system(lanes), wording, WORDS, ANSWER_START, _ORDER, numbers)
     return hashlib.sha256(repr(text).encode()).hexdigest()[:16]
+
+
+def _sorted_out(safe: Sequence[int], tight: Sequence[int], unsafe: Sequence[int]) -> str:
+    return f"Safe: {_listed(safe)}. Tight: {_listed(tight)}. Unsafe: {_listed(unsafe)}."
 
 
 def _listed(actions: Sequence[int]) -> str:

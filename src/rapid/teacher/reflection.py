@@ -30,11 +30,11 @@ def moment(episode: Episode, facts_T: Sequence[Facts]) -> int:
     """Return the step of an episode that is worth remembering.
 
     After a crash it is the last decision but braking among the last `SHOWN`: what is done once nothing helps teaches
-    nothing. Without one it is where the chosen action left the least room.
+    nothing. Without one it is where the chosen action's best way on was worst.
     """
     actions = [decision.action for decision in episode.decisions]
     if not episode.crashed:
-        return min(range(len(actions)), key=lambda step: facts_T[step].room(actions[step]))
+        return min(range(len(actions)), key=lambda step: facts_T[step].ways[actions[step]][::2])
     last = range(max(len(actions) - SHOWN, 0), len(actions))
     return max((step for step in last if actions[step] != SLOWER), default=last[0])
 

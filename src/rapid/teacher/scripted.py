@@ -74,8 +74,8 @@ class Scripted:
 
 
 def safe_actions(facts: Facts) -> list[int]:
-    """Return the available actions that the facts call safe; all available ones if there is none."""
-    return [action for action in facts.available if facts.safe(action)] or list(facts.available)
+    """Return the available actions that lead on about as well as the best one."""
+    return [action for action in facts.available if facts.is_open(action)]
 
 
 def _closed_form_rule(facts: Facts) -> tuple[int, str]:
@@ -104,6 +104,19 @@ def _forecast_rule(facts: Facts) -> tuple[int, str]:
     return SLOWER, "everything else ends in a conflict"
 
 
-_RULES: dict[str, Callable[[Facts], tuple[int, str]]] = {"rule": _closed_form_rule, "rule-forecast": _forecast_rule}
+def _foresight_rule(facts: Facts) -> tuple[int, str]:
+    """The order in which the language models are told to prefer actions, among those that lead on as well as any."""
+    for action in (LANE_RIGHT, FASTER, IDLE, LANE_LEFT, SLOWER):
+        if action in facts.available and facts.is_open(action):
+            break
+    return action, "it leads on as well as any"
+
+
+_RULES: dict[str, Callable[[Facts], tuple[int, str]]] = {
+    "rule": _closed_form_rule,
+    "rule-forecast": _forecast_rule,
+    "rule-foresight": _foresight_rule,
+}
 SCRIPTED = ("random", *_CONSTANTS, *_RULES, "uniform-safe")
-"""`rule` uses the closed-form checks, `rule-forecast` the forecast; `uniform-safe` draws among what is called safe."""
+"""`rule` uses the closed-form checks, `rule-forecast` the forecast, `rule-foresight` the best ways on, from which
+`uniform-safe` draws one as good as any."""

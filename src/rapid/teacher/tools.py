@@ -64,7 +64,7 @@ def _forecast_action(facts: Facts, arguments: dict[str, Any]) -> str:
     action = action_named(arguments.get("action"))
     if action is None:
         return f"Error: `action` must be one of {', '.join(WORDS.values())}."
-    return f"{WORDS[action]}: in the next 4 s {outcome(facts, action)}."
+    return f"{WORDS[action]}: {outcome(facts, action)}."
 
 
 _ACTION = {"action": {"type": "string", "enum": list(WORDS.values())}}
@@ -74,7 +74,11 @@ _TOOLS: dict[str, tuple[Callable[[Facts, dict[str, Any]], str], str, dict[str, A
     "available_lanes": (_available_lanes, "List the lanes that can be reached with one action.", {}),
     "cars_on_lane": (_cars_on_lane, "Tell the nearest car ahead and behind on a lane.", _LANE),
     "check_action": (_check_action, "Check an action against gaps and closing speeds.", _ACTION),
-    "forecast_action": (_forecast_action, "Look four seconds ahead after an action.", _ACTION),
+    "forecast_action": (
+        _forecast_action,
+        "Look six seconds ahead for the best way to drive on.",
+        _ACTION,
+    ),
 }
 TOOL_NAMES = tuple(_TOOLS)
 
