@@ -60,6 +60,8 @@ def test_an_exported_agent_drives_the_same(roads, tmp_path):
         {"kind": "attentive", "position": "sinusoidal", "layers": 2, "decoder_layers": 2, "heads": 4},
         {"kind": "rapid", "input": "raw", "position": "learned", "mask_absent": False, "decoder_layers": 2},
         {"kind": "rapid", "input": "normalized", "action_token": "ego", "decoder_layers": 2},
+        {"kind": "mlp", "input": "ego", "hidden": (16,)},
+        {"kind": "rapid", "input": "ego"},
         {"kind": "rapid", "gate": "tanh"},
         {"kind": "rapid", "gate": "tanh", "num_policies": 4, "top_k": 3},
         {"kind": "rapid", "num_policies": 4, "top_k": 1},

@@ -141,9 +141,10 @@ class NetworkConfig:
     """Width of the feed-forward layers."""
     hidden: tuple[int, ...] = (256, 256)
     """Hidden layers of the MLPs."""
-    input: Literal["raw", "normalized", "ego"] = "ego"
+    input: Literal["raw", "normalized", "ego", "near"] = "near"
     """What the network reads: the features as they are, scaled to +-1 by highway-env's own ranges, or
-    ego-relative (positions and velocities of the others relative to the ego, scaled)."""
+    ego-relative (positions and velocities of the others relative to the ego, scaled), or `near`: the same with three
+    features more, which tell short distances apart and what closes in."""
     position: Literal["learned", "sinusoidal", "ego", "none"] = "ego"
     """What marks a token's place: an embedding per slot, a sinusoid, a mark on the ego's row only, or nothing."""
     action_token: Literal["prepend", "ego"] = "prepend"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rapid.networks.blocks import Block, Transformer
+from rapid.networks.encoding import BESIDE, NEAR, NEAR_FEATURES
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.q_network import ActionDecoder, MlpHead, QNetwork
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
@@ -95,12 +96,15 @@ def _q_values(graph: Graph, network: QNetwork) -> str:
     features, unit_F = "obs", np.ones(NUM_FEATURES, np.float32)
     if encoding.kind == "normalized":
         unit_F = _array(encoding.scale_F)
-    elif encoding.kind == "ego":
+    elif encoding.kind in ("ego", "near"):
         ego = graph.cut("obs", 0, 1, 1)
         features, unit_F = (
             graph.node("Sub", "obs", graph.node("Mul", ego, _array(encoding.relative_VF))),
             _array(encoding.unit_F),
         )
+        if encoding.kind == "near":
+            features = graph.node("Concat", features, *_near(graph, features), axis=-1)
+            unit_F = np.append(unit_F, np.ones(NEAR_FEATURES, np.float32))
     present = None
     if encoding.mask_absent:
         present = graph.node("Greater", graph.cut("obs", 0, 1, 2), _array(encoding.absent_V1))
@@ -113,8 +117,17 @@ def _q_values(graph: Graph, network: QNetwork) -> str:
     return _decoder(graph, head.decoder, _mixture(graph, head.mixture, features, unit_F, mask), mask)
 
 
+def _near(graph: Graph, relative: str) -> tuple[str, str, str]:
+    """Return what `near` adds to the ego-relative features, each (B, V, 1)."""
+    ahead, aside, faster = (graph.cut(relative, place, place + 1, 2) for place in (1, 2, 3))
+    distance = graph.node("Add", graph.node("Abs", ahead), NEAR)
+    share = graph.node("Mul", aside, 1 / BESIDE)
+    beside = graph.node("Exp", graph.node("Neg", graph.node("Mul", share, share)))
+    return graph.node("Div", ahead, distance), beside, graph.node("Div", faster, distance)
+
+
 def _mlps(graph: Graph, head: MlpHead, features: str, unit_F: Array) -> str:
-    flat, total = graph.reshape(features, -1, NUM_VEHICLES * NUM_FEATURES), ""
+    flat, total = graph.reshape(features, -1, NUM_VEHICLES * len(unit_F)), ""
     weights_N = [1.0] if head.weights_N is None else _array(head.weights_N).tolist()
     for mlp, weight in zip(head.mlps, weights_N, strict=True):
         layers = [layer for layer in cast(nn.Sequential, mlp) if isinstance(layer, nn.Linear)]

@@ -1,5 +1,7 @@
 """What networks read: ranges, ego-relative features, absent rows."""
 
+import math
+
 import pytest
 import torch
 
@@ -37,6 +39,17 @@ def test_ego_relative_features_by_hand():
     assert features[0, 2].tolist() == [0] * 5
     assert mask is not None
     assert mask[0, 0, 0].tolist() == [0.0, 0.0] + [-torch.inf] * 13
+
+
+def test_near_features_by_hand():
+    obs = torch.zeros(1, 15, 5)
+    obs[0, 0] = torch.tensor([1, 300, 4, 20, 1])
+    obs[0, 1] = torch.tensor([1, 340, 7, 15, 0])
+    features, _ = Encoding("near", lanes=3, mask_absent=True)(obs)
+    plain, _ = Encoding("ego", lanes=3, mask_absent=True)(obs)
+    assert torch.equal(features[..., :5], plain)
+    assert features[0, 1, 5:].tolist() == pytest.approx([40 / 50, math.exp(-1), -5 / 50])
+    assert features[0, 2].tolist() == [0] * 8
 
 
 def test_ego_relative_features_do_not_depend_on_where_along_the_road(roads):

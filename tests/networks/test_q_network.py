@@ -16,7 +16,7 @@ def make(seed: int = 0, **settings):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("reading", ["raw", "normalized", "ego"])
+@pytest.mark.parametrize("reading", ["raw", "normalized", "ego", "near"])
 @pytest.mark.parametrize("position", ["learned", "sinusoidal", "ego", "none"])
 @pytest.mark.parametrize("token", ["prepend", "ego"])
 def test_every_combination_gives_finite_q_values_and_gradients(roads, kind, reading, position, token):
@@ -66,7 +66,7 @@ def test_positions_tell_slots_apart(roads):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("reading", ["raw", "normalized", "ego"])
+@pytest.mark.parametrize("reading", ["raw", "normalized", "ego", "near"])
 def test_absent_rows_never_matter_when_masked(roads, kind, reading):
     network = make(kind=kind, input=reading, position="ego", mask_absent=True)
     if kind == "rapid":

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from rapid.config import NetworkConfig
 from rapid.networks.blocks import Transformer
-from rapid.scenarios import NUM_FEATURES, NUM_VEHICLES
+from rapid.networks.encoding import num_inputs
+from rapid.scenarios import NUM_VEHICLES
 
 
 class PolicyEncoder(nn.Module):
@@ -20,7 +21,7 @@ class PolicyEncoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.projection = nn.Linear(NUM_FEATURES, config.width)
+        self.projection = nn.Linear(num_inputs(config.input), config.width)
         if config.position == "learned":
             self.position = nn.Parameter(torch.empty(NUM_VEHICLES, config.width))
         elif config.position == "ego":
@@ -57,7 +58,7 @@ class MixtureOfPolicies(nn.Module):
         self.top_k, self.gate_kind = min(config.top_k, num_policies), config.gate
         self.policies = nn.ModuleList(PolicyEncoder(config) for _ in range(num_policies))
         self.gate_NV = nn.Parameter(torch.zeros(num_policies - 1, NUM_VEHICLES))
-        self.router = _router(config.width, num_policies) if num_policies > 1 else None
+        self.router = _router(num_inputs(config.input), config.width, num_policies) if num_policies > 1 else None
 
     def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
         """Return the mixed tokens (B, V, D)."""
@@ -101,9 +102,9 @@ class MixtureOfPolicies(nn.Module):
         return gate_learns or bool(self.gate_NV[index - 1].any())
 
 
-def _router(width: int, num_policies: int) -> nn.Sequential:
+def _router(inputs: int, width: int, num_policies: int) -> nn.Sequential:
     """A small MLP that scores the policies for one vehicle."""
-    return nn.Sequential(nn.Linear(NUM_FEATURES, width), nn.ReLU(), nn.Linear(width, num_policies))
+    return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, num_policies))
 
 
 def sinusoids(length: int, width: int) -> Tensor:

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.blocks import Transformer
-from rapid.networks.encoding import Encoding
+from rapid.networks.encoding import Encoding, num_inputs
 from rapid.networks.mixture import MixtureOfPolicies
-from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
+from rapid.scenarios import NUM_ACTIONS, NUM_VEHICLES
 from rapid.seeding import torch_stream
 
 Phase = Literal["distill", "adapt", "all"]
@@ -89,15 +89,15 @@ class MlpHead(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         count = config.num_policies if config.kind == "mlp-mixture" else 1
-        self.mlps = nn.ModuleList(self._mlp(config.hidden) for _ in range(count))
+        self.mlps = nn.ModuleList(self._mlp(num_inputs(config.input), config.hidden) for _ in range(count))
         self.weights_N = nn.Parameter(torch.zeros(count)) if count > 1 else None
 
     @staticmethod
-    def _mlp(hidden: tuple[int, ...]) -> nn.Sequential:
-        sizes = (NUM_VEHICLES * NUM_FEATURES, *hidden)
+    def _mlp(inputs: int, hidden: tuple[int, ...]) -> nn.Sequential:
+        sizes = (NUM_VEHICLES * inputs, *hidden)
         layers: list[nn.Module] = [nn.Flatten()]
-        for inputs, outputs in zip(sizes, hidden, strict=False):
-            layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+        for before, after in zip(sizes, hidden, strict=False):
+            layers += [nn.Linear(before, after), nn.ReLU()]
         return nn.Sequential(*layers, nn.Linear(sizes[-1], NUM_ACTIONS))
 
     def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
