@@ -78,7 +78,10 @@ class Encoding(nn.Module):
         self.register_buffer("relative_VF", 1 - kept_VF, persistent=False)
 
     def forward(self, obs_BVF: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the features (B, V, F), with `near` three more, and the mask to add to attention scores (B, 1, 1, V), or None."""
+        """Return the features (B, V, F), with `near` three more, and the mask (B, 1, 1, V) to add to attention scores.
+
+        Without `mask_absent` there is no mask: None.
+        """
         features_BVF = self._features(obs_BVF)
         if not self.mask_absent:
             return features_BVF, None
