@@ -298,6 +298,9 @@ class Config:
     """Where the data is collected and policies are trained and measured."""
     simulator: Literal["compiled", "highway-env"] = "compiled"
     """The compiled twin, or highway-env itself (about a thousand times slower)."""
+    data: str = ""
+    """Instead of collecting: `shipped` takes the datasets that come with the package, which needs no model; anything
+    else is a directory that holds the datasets `teacher` and `random`."""
     seed: int = 0
     """The seed from which every random stream is derived."""
     threads: int = 1

@@ -19,6 +19,7 @@ from rapid.data.collection import Budget, collect, parse_shard
 from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
 from rapid.data.journal import exclusive
 from rapid.data.sharding import collect_shards, shards_of
+from rapid.data.shipped import SHIPPED, shipped_sets
 from rapid.engines import check_engine
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.agents import open_agent
@@ -37,6 +38,7 @@ from rapid.seeding import stream_seed
 from rapid.simulator import make_vec
 from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import Teacher, check_teacher, make_teacher
+from rapid.teacher.models import is_present
 from rapid.tracking import Tracker, check_tracking
 from rapid.training.offline import distill
 from rapid.training.online import adapt
@@ -66,6 +68,8 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
         RapidError: anything about the input or the surroundings that keeps the run from its end.
     """
     check(config)
+    if config.data not in ("", SHIPPED):
+        config = replace(config, data=str(Path(config.data).resolve()))
     _check_whole(config)
     if restart and restart not in STEPS:
         raise RapidError(f"Unknown step '{restart}'{did_you_mean(restart, STEPS)} Steps: {', '.join(STEPS)}.")
@@ -95,6 +99,8 @@ def _run_steps(config: Config, home: RunDirectory, restart: str, say: Callable[[
         say(heading)
         start = time.monotonic()
         facts = actions[step](config, home)
+        if "note" in facts:
+            say(facts["note"])
         home.finish(step, time.monotonic() - start, commit=commit(), **facts)
     say("\n" + (home.path / "evaluate" / "summary.txt").read_text(encoding="utf-8"))
     times = ", ".join(f"{step} {format_seconds(home.facts(step)['seconds'])}" for step in STEPS)
@@ -149,6 +155,9 @@ def _check_whole(config: Config) -> None:
             f"adapt.train is 'adapter', but a network of kind '{network.kind}' with {network.num_policies} policies "
             "has no adapter. Choose network.kind 'rapid' with network.num-policies 2, or adapt.train 'all'."
         )
+    if config.data:
+        _given_data(config)
+        return
     for source, have, share in (
         ("teacher", collected.teacher_transitions, mixture.p),
         ("random", collected.random_transitions, 1 - mixture.p),
@@ -164,6 +173,9 @@ def _check_whole(config: Config) -> None:
 
 
 def _collect(config: Config, home: RunDirectory) -> dict[str, Any]:
+    if config.data:
+        teacher_data, random_data = _given_data(config)
+        return {"teacher_transitions": len(teacher_data), "random_transitions": len(random_data)}
     teacher_data = collect_transitions(config, home.path / "collect" / "teacher", "teacher")
     if len(teacher_data) < config.collect.teacher_transitions:
         raise RapidError(
@@ -174,6 +186,38 @@ def _collect(config: Config, home: RunDirectory) -> dict[str, Any]:
     alone = replace(config, collect=replace(config.collect, engine="local", workers=1, shards=1))
     random_data = collect_transitions(alone, home.path / "collect" / "random", "random")
     return {"teacher_transitions": len(teacher_data), "random_transitions": len(random_data)}
+
+
+def _data_folders(config: Config, directory: Path) -> tuple[Path, Path]:
+    """Where the teacher's and the random dataset of the run in `directory` are: given, shipped, or its own."""
+    folder = Path(config.data) if config.data else directory / "collect"
+    if config.data == SHIPPED:
+        folder = Path(f"{SHIPPED}:{get_scenario(config.scenario).name}")
+    return folder / "teacher", folder / "random"
+
+
+def _given_data(config: Config) -> tuple[Dataset, Dataset]:
+    """Load the teacher's and the random dataset that the settings name, and see that the mixture can be made of them.
+
+    Raises:
+        RapidError: none are shipped for the scenario, they are not there, damaged, of another scenario, or too small.
+    """
+    scenario = get_scenario(config.scenario).name
+    shipped = sorted({name.partition("/")[0] for name in shipped_sets()})
+    if config.data == SHIPPED and scenario not in shipped:
+        raise RapidError(
+            f"No data is shipped for the scenario '{scenario}'. Choose --scenario {', '.join(shipped)}, or leave "
+            "--data out, to collect."
+        )
+    teacher, random = map(load_dataset, _data_folders(config, Path()))
+    for name, dataset in (("teacher", teacher), ("random", random)):
+        if dataset.scenario != scenario:
+            raise RapidError(
+                f"The {name} dataset in '{config.data}' is of the scenario '{dataset.scenario}', not '{scenario}'. "
+                f"Choose --scenario {dataset.scenario}, or other data."
+            )
+    mix(teacher, random, config.mix.p, config.mix.size, config.seed, config.mix.level)
+    return teacher, random
 
 
 def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher") -> Dataset:
@@ -228,8 +272,7 @@ def _worker_teacher(settings: TeacherConfig, lanes: int, seed: int, threads: int
 
 
 def _mix(config: Config, home: RunDirectory) -> dict[str, Any]:
-    collected = home.path / "collect"
-    mixed = mix_datasets(config, collected / "teacher", collected / "random", home.path / "mix")
+    mixed = mix_datasets(config, *_data_folders(config, home.path), home.path / "mix")
     return {"transitions": len(mixed), "teacher_share": mixed.teacher_share}
 
 
@@ -333,14 +376,35 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
 def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
     specs: list[str] = list(FLOORS)
     is_floor = config.teacher.backend == "scripted" and config.teacher.model in FLOORS
+    note = ""
     if config.evaluate.teacher_spawns and not is_floor:
-        specs.append(TEACHER)
+        note = _why_no_teacher(config)
+        # The place is kept: the others' parts have the same numbers, should the teacher be there next time.
+        specs.append("" if note else TEACHER)
     if config.evaluate.planner_spawns and config.simulator == "compiled":
         specs.append(PLANNER)
     specs += [str(home.path / "distill" / name / "agent") for name in ("cloning", "offline-dqn", "rapid")]
     specs.append(str(home.path / "adapt" / "rapid" / "agent"))
     rows = _measure(config, config.adapt.scenario or config.scenario, specs, home.path / "evaluate")
-    return {"episodes": len(rows)}
+    return {"episodes": len(rows), **({"note": note} if note else {})}
+
+
+def _why_no_teacher(config: Config) -> str:
+    """Why the teacher is not measured, or nothing. A run on given data measures their driver, and fetches no model."""
+    if not config.data:
+        return ""
+    driver, settings = _given_data(config)[0].drivers.get("teacher", {}), config.teacher
+    if (driver.get("backend"), driver.get("model")) != (settings.backend, settings.model):
+        return (
+            f"The teacher is not measured: {driver.get('name', 'another')} drove in the data, and the settings name "
+            f"{settings.backend} {settings.model}."
+        )
+    if settings.backend == "local" and not is_present(settings.model):
+        return (
+            f"The teacher is not measured: {settings.model} is not on this machine, and a run on given data fetches no "
+            f"model. To have its row: rapid models pull {settings.model}, then this run with --from evaluate."
+        )
+    return ""
 
 
 def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
@@ -379,10 +443,12 @@ def _measure(
 ) -> list[EpisodeRow]:
     """Drive every agent over the test spawns under every attack; an agent that is done is not driven again.
 
-    `labels` are names for agents whose own would not tell them apart.
+    An empty name only takes a number. `labels` are names for agents whose own would not tell them apart.
     """
     rows: list[EpisodeRow] = []
     for number, spec in enumerate(specs):
+        if not spec:
+            continue
         part = out / "parts" / f"{number:02}.parquet"
         if not part.exists():
             agent = _open(config, spec, scenario)
@@ -453,8 +519,13 @@ def write_run_report(config: Config, directory: Path) -> Path:
         for path in sorted((directory / "evaluate" / "parts").glob("*.recordings.json"), reverse=True)
         for recording in load_recordings(path)
     ]
-    teacher_data = load_dataset(directory / "collect" / "teacher")
+    teacher_data = load_dataset(_data_folders(config, directory)[0])
     notes = []
+    if config.data:
+        notes.append(f"Nothing was collected in this run; its data: {config.data}.")
+    measured = read_json(steps["evaluate"]) if steps["evaluate"].exists() else {}
+    if "note" in measured:
+        notes.append(measured["note"])
     if config.scale != "full":
         notes.append(f"Scale {config.scale}: one training seed and few spawns. This shows that it works, not how well.")
     data = ReportData(

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
+from rapid.data.shipped import dataset_folder
 from rapid.data.tables import from_table, read_parquet, to_table, write_parquet
 from rapid.data.transitions import RANDOM, SOURCES, TEACHER, Transitions, concatenate
 from rapid.errors import RapidError
@@ -96,12 +97,12 @@ def save_dataset(dataset: Dataset, directory: str | os.PathLike[str]) -> None:
 
 
 def load_dataset(path: str | os.PathLike[str]) -> Dataset:
-    """Read a dataset and check it whole.
+    """Read a dataset, in a directory or shipped (``shipped:lane-3-density-2/teacher``), and check it whole.
 
     Raises:
         RapidError: no dataset there, of another schema version, cut off, damaged, or with values that make no sense.
     """
-    root = Path(path)
+    root = dataset_folder(path)
     meta = read_json(root / DATASET_FILE, "dataset")
     if not isinstance(meta, dict) or meta.get("format") != "rapid-dataset":
         raise RapidError(f"'{root / DATASET_FILE}' does not describe a RAPID dataset. Give the directory of a dataset.")

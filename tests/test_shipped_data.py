@@ -1,0 +1,111 @@
+"""Datasets that come with the package, and a run on them, which asks no model for anything."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from rapid import pipeline
+from rapid.config import Config, apply_overrides, preset
+from rapid.data.dataset import load_dataset
+from rapid.data.shipped import dataset_folder, shipped_sets
+from rapid.data.transitions import RANDOM, TEACHER
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import load_rows
+from rapid.files import read_json
+from rapid.verbs import call
+
+SMALL = {
+    "data": "shipped",
+    "mix": {"size": 40},
+    "network": {"width": 16, "heads": 2, "feedforward": 16},
+    "distill": {"iterations": 4, "evaluate_every": 0, "loss": {"robust": {"steps": 2}}},
+    "adapt": {"steps": 40, "learning_starts": 20, "evaluate_every": 0},
+    "evaluate": {"spawns": 2, "planner_spawns": 0, "curve_spawns": 1, "attacks": ["none"]},
+}
+
+
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
+    monkeypatch.setenv("RAPID_CACHE", str(tmp_path / "cache"))  # no model is there
+    return apply_overrides(preset("strong", "tiny"), SMALL)
+
+
+@pytest.mark.parametrize("name", shipped_sets())
+def test_every_shipped_set_is_whole_and_names_no_place(name: str):
+    data = load_dataset(f"shipped:{name}")
+    scenario, kind = name.split("/")
+    assert (data.scenario, len(data) >= 15_000) == (scenario, True)
+    assert set(data.transitions.source_N.tolist()) == {RANDOM if kind == "random" else TEACHER}
+    assert data.log is not None
+    assert data.log.num_rows == len(data)
+    if kind == "teacher":
+        assert all(data.log.column("transcript").to_pylist())
+    facts = (dataset_folder(f"shipped:{name}") / "dataset.json").read_text()
+    assert not re.search(r"/(home|root|tmp|work|Users)\b|api_key|base_url", facts)
+
+
+def test_a_run_on_shipped_data_goes_from_the_mixture_to_the_page_without_a_model(config: Config, tmp_path: Path):
+    said: list[str] = []
+    page = pipeline.run(config, tmp_path / "run", say=said.append).read_text()
+    assert not (tmp_path / "run" / "collect").exists()
+    assert not (tmp_path / "cache" / "models").exists()
+    assert load_dataset(tmp_path / "run" / "mix").drivers["teacher"]["name"] == "smollm2-135m"
+    measured = {row.agent for row in load_rows(tmp_path / "run/evaluate/episodes.parquet")}
+    assert "RAPID" in measured
+    assert "smollm2-135m" not in measured
+    assert any("rapid models pull smollm2-135m" in line for line in said)
+    assert "its data: shipped" in page
+    assert "rapid models pull smollm2-135m" in page
+    assert "rapid models pull" in pipeline.report_again(tmp_path / "run").read_text()
+
+
+def test_a_folder_with_both_sets_serves_too_and_its_driver_is_measured(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shutil.copytree(dataset_folder("shipped:lane-3-density-2/rule"), tmp_path / "mine" / "teacher")
+    shutil.copytree(dataset_folder("shipped:lane-3-density-2/random"), tmp_path / "mine" / "random")
+    monkeypatch.chdir(tmp_path)
+    driver = {"teacher": {"backend": "scripted", "model": "rule-forecast"}}
+    monkeypatch.setattr(pipeline, "_report", lambda config, home: {})
+    pipeline.run(apply_overrides(config, {"data": "mine", **driver}), tmp_path / "run", say=lambda line: None)
+    assert "rule-forecast" in {row.agent for row in load_rows(tmp_path / "run/evaluate/episodes.parquet")}
+    # Kept whole, so that the page can be written again from anywhere.
+    assert read_json(tmp_path / "run" / "run.json")["config"]["data"] == str(tmp_path / "mine")
+
+
+def test_a_driver_other_than_the_datas_is_not_measured_as_the_teacher(config: Config):
+    other = {"teacher": {"backend": "scripted", "model": "rule-forecast"}}
+    assert "smollm2-135m drove in the data" in pipeline._why_no_teacher(apply_overrides(config, other))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        ({"scenario": "lane-2-density-1"}, "No data is shipped .* lane-3-density-2, lane-4-density-2.5"),
+        ({"scenario": "lane-3-density-2:progress"}, "No data is shipped"),
+        ({"data": "nowhere"}, "There is no dataset at '.*nowhere/teacher/dataset.json'"),
+        ({"mix": {"size": 90_000}}, "The mixture needs 22500 teacher transitions .*, but there are 15028"),
+    ],
+)
+def test_data_that_cannot_serve_is_refused_before_any_work(
+    config: Config, tmp_path: Path, overrides: dict[str, object], says: str
+):
+    with pytest.raises(RapidError, match=says):
+        pipeline.run(apply_overrides(config, overrides), tmp_path / "run", say=lambda line: None)
+    assert not (tmp_path / "run").exists()
+
+
+def test_data_of_another_scenario_is_refused(config: Config, tmp_path: Path):
+    given = {"data": str(dataset_folder("shipped:lane-3-density-2/teacher").parent), "scenario": "lane-4-density-2.5"}
+    with pytest.raises(RapidError, match="is of the scenario 'lane-3-density-2', not"):
+        pipeline.run(apply_overrides(config, given), tmp_path / "run", say=lambda line: None)
+
+
+def test_a_shipped_set_stands_where_a_path_is_expected(tmp_path: Path):
+    sets = [f"shipped:lane-3-density-2/{name}" for name in ("rule", "random")]
+    assert call("mix", [*sets, "--size", "40", "--out", str(tmp_path / "mixed")]) == 0
+    assert load_dataset(tmp_path / "mixed").drivers["teacher"]["name"] == "rule-forecast"
+    with pytest.raises(RapidError, match="did you mean 'lane-3-density-2/rule'"):
+        load_dataset("shipped:lane-3-density-2/rules")
