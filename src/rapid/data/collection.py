@@ -2,8 +2,8 @@
 
 A directory in progress holds ``collecting/``: the settings, a Parquet part for each finished group of episodes and the
 journal of the group in progress, and what a teacher that reflects has learned so far. A complete one holds the dataset
-alone. The same command goes on wherever a process was ended, by any signal, and ends with the same bytes as if it had
-never been.
+alone. The same command goes on wherever a process was ended, by any signal, and ends with the same transitions, byte
+for byte, and the same log, apart from the seconds that its decisions took.
 """
 
 import json
