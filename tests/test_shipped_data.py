@@ -8,6 +8,7 @@ import pytest
 
 from rapid import pipeline
 from rapid.config import Config, apply_overrides, preset
+from rapid.data.card import card
 from rapid.data.dataset import load_dataset
 from rapid.data.shipped import dataset_folder, shipped_sets
 from rapid.data.transitions import RANDOM, TEACHER
@@ -18,7 +19,7 @@ from rapid.verbs import call
 
 SMALL = {
     "data": "shipped",
-    "mix": {"size": 40},
+    "mix": {"p": 0.25, "size": 40},
     "network": {"width": 16, "heads": 2, "feedforward": 16},
     "distill": {"iterations": 4, "evaluate_every": 0, "loss": {"robust": {"steps": 2}}},
     "adapt": {"steps": 40, "learning_starts": 20, "evaluate_every": 0},
@@ -44,6 +45,22 @@ def test_every_shipped_set_is_whole_and_names_no_place(name: str):
         assert all(data.log.column("transcript").to_pylist())
     facts = (dataset_folder(f"shipped:{name}") / "dataset.json").read_text()
     assert not re.search(r"/(home|root|tmp|work|Users)\b|api_key|base_url", facts)
+
+
+def cards() -> str:
+    """The cards of the shipped sets as the documentation shows them, without what is the same in all of them."""
+    texts: list[str] = []
+    for name in shipped_sets():
+        _, _, text = card(load_dataset(f"shipped:{name}")).partition("\n")
+        own = text.partition("## Reading it")[0].strip()
+        texts.append(f"### shipped:{name}\n\n{own}\n".replace("\n## ", "\n#### "))
+    return "\n".join(texts)
+
+
+def test_the_documentation_shows_their_cards():
+    page = (Path(__file__).parents[1] / "docs" / "data.md").read_text()
+    # After a change: replace what follows "## Cards" by what cards() returns.
+    assert page.partition("## Cards\n\n")[2] == cards()
 
 
 def test_a_run_on_shipped_data_goes_from_the_mixture_to_the_page_without_a_model(config: Config, tmp_path: Path):

@@ -61,10 +61,11 @@ def card(dataset: Dataset) -> str:
 def _decision_lines(decisions: dict[str, Any], count: int) -> list[str]:
     """Return what the log adds up to, as a list."""
     status = ", ".join(f"{name} {amount}" for name, amount in decisions["status"].items())
+    read, written = (f"{decisions[name]:.0f}" for name in ("tokens_in", "tokens_out"))
     return [
         f"- Status: {status}; {decisions['retries']:g} retries",
         f"- {decisions['prompts']} different prompts",
-        f"- {decisions['tokens_in']:g} tokens read, {decisions['tokens_out']:g} written, cost {decisions['cost']:g}",
+        f"- {read} tokens read, {written} written, cost {decisions['cost']:g}",
         f"- {decisions['seconds']:.1f} s of deciding, {decisions['seconds'] / max(count, 1):.3f} s a decision",
     ]
 
