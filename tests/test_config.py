@@ -85,7 +85,7 @@ def test_wrong_settings_are_named(overrides: dict[str, Any], says: str):
     [
         ({"network": {"top_k": 3}}, "network.top_k"),
         ({"network": {"num_policies": 0}}, "network.num_policies"),
-        ({"network": {"width": 31}}, "network.width"),
+        ({"network": {"width": 31, "heads": 2}}, "network.width"),
         ({"mix": {"p": 1.5}}, "mix.p"),
         ({"mix": {"p": float("nan")}}, "mix.p"),
         ({"adapt": {"offline_share": 1.0}}, "adapt.offline_share"),

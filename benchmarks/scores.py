@@ -1,0 +1,232 @@
+"""The scores: RAPID and its baselines over several training seeds, from the shipped data, beside floors and ceiling.
+
+For every seed: phase 2 on the mixture of the data's scenario (RAPID; MLPs by DQN, double DQN, CQL; behaviour cloning),
+then phase 3 in every target scenario (RAPID's adapter; a plain double-DQN MLP from scratch, the same number of steps),
+then all of them over the test spawns, clean and attacked. Everything finished is kept under `--work`: an interrupted
+call goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there:
+`scores.parquet` (raw rows), `scores.md`. Of the floors and the planner it shows the rows in `floors.parquet`, which
+drove the same spawns.
+
+    python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
+    python benchmarks/scores.py --table
+"""
+
+import argparse
+import sys
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rapid import pipeline
+from rapid.config import Config, TeacherConfig, preset
+from rapid.evaluation.agents import open_agent
+from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
+from rapid.evaluation.rollouts import evaluate_agent
+from rapid.evaluation.statistics import Estimate, paired_difference
+from rapid.evaluation.summary import summary_text
+from rapid.files import write_text
+from rapid.progress import task
+from rapid.runs import commit
+from rapid.scenarios import PAPER_SCENARIOS, get_scenario
+from rapid.spawns import spawn_seeds
+from rapid.teacher import make_teacher
+
+ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
+FLOORS = ("slower", "rule", "planner")
+WAY = {"lane-3-density-2": 0.75, "lane-4-density-2.5": 0.70, "lane-5-density-3": 0.50}
+"""The share of the way from always-slower to the planner that is aimed at."""
+
+
+def offline_recipes(config: Config) -> dict[str, Config]:
+    """Return the settings of every agent that is trained offline, by name."""
+    mlp = replace(config, network=replace(config.network, kind="mlp"))
+
+    def trained(alpha: float, double: bool, algorithm: str = "dqn") -> Config:
+        loss = replace(mlp.distill.loss, conservative_weight=alpha, robust_weight=0.0, double=double)
+        optimizer = replace(mlp.distill.optimizer, algorithm=algorithm)
+        return replace(mlp, distill=replace(mlp.distill, loss=loss, optimizer=optimizer))
+
+    calm = replace(config.distill, loss=replace(config.distill.loss, robust_weight=0.0))
+    return {
+        "distilled": config,
+        "distilled, no J_robust": replace(config, distill=calm),
+        "offline DQN": trained(0.0, double=False),
+        "offline DDQN": trained(0.0, double=True),
+        "CQL": trained(1.0, double=False),
+        "behaviour cloning": trained(0.0, double=False, algorithm="bc"),
+    }
+
+
+def train(config: Config, mixture: Path, work: Path, scenarios: Iterable[str]) -> dict[str, list[tuple[str, Path]]]:
+    """Train what is missing and return the agents to be measured in each scenario, as (name, directory)."""
+    agents: list[tuple[str, Path]] = []
+    for name, settings in offline_recipes(config).items():
+        home = work / name.replace(" ", "-").replace(",", "")
+        if not (home / "agent" / "config.json").exists():
+            pipeline.distill_agent(settings, mixture, home, name)
+        agents.append((name, home / "agent"))
+    measured: dict[str, list[tuple[str, Path]]] = {}
+    from_scratch = replace(
+        config.adapt,
+        train="scratch",
+        exploration_start=1.0,
+        exploration_end=0.05,
+        loss=replace(config.adapt.loss, conservative_weight=0.0),
+        optimizer=replace(config.adapt.optimizer, learning_rate=5e-4),
+    )
+    for scenario in scenarios:
+        online = {
+            "RAPID": (replace(config.adapt, scenario=scenario), work / "distilled", mixture),
+            "online DDQN": (replace(from_scratch, scenario=scenario), work / "offline-DDQN", None),
+        }
+        measured[scenario] = list(agents)
+        for name, (settings, origin, data) in online.items():
+            home = work / f"{name.replace(' ', '-')}-{scenario}"
+            if not (home / "agent" / "config.json").exists():
+                pipeline.adapt_agent(replace(config, adapt=settings), origin / "agent", data, home, name)
+            measured[scenario].append((name, home / "agent"))
+    return measured
+
+
+def measure(config: Config, measured: dict[str, list[tuple[str, Path]]], work: Path, spawns: int) -> None:
+    """Drive every agent that has not been driven."""
+    for scenario, agents in measured.items():
+        for name, directory in agents:
+            path = work / "rows" / f"{scenario}-{spawns}-{name.replace(' ', '-').replace(',', '')}.parquet"
+            if path.exists():
+                continue
+            agent = open_agent(str(directory), scenario, config.seed)
+            agent.name = name
+            with task(f"evaluate, {name}, {scenario}, seed {config.seed}", spawns * len(ATTACKS), "episodes") as work_:
+                rows = evaluate_agent(
+                    agent,
+                    scenario,
+                    spawn_seeds("test", spawns),
+                    ATTACKS,
+                    generator_seed=config.seed,
+                    training_seed=config.seed,
+                    commit=commit(),
+                    progress=work_.advance,
+                )
+            save_rows(path, rows)
+
+
+def measure_teacher(work: Path, scenarios: Iterable[str], spawns: int) -> None:
+    """Drive the default teacher; it needs its model."""
+    for scenario in scenarios:
+        path = work / "rows" / f"{scenario}-{spawns}-teacher.parquet"
+        if not path.exists():
+            teacher = make_teacher(TeacherConfig(), get_scenario(scenario).lanes, 0)
+            with task(f"evaluate, {teacher.name}, {scenario}", spawns, "episodes") as shown:
+                rows = evaluate_agent(
+                    teacher, scenario, spawn_seeds("test", spawns), ("none",), commit=commit(), progress=shown.advance
+                )
+            save_rows(path, rows)
+
+
+def difference(ours: list[EpisodeRow], theirs: list[EpisodeRow], name: str = "episode_return") -> Estimate:
+    """Return the paired difference of two agents' clean driving."""
+    return paired_difference(
+        column(ours, name),
+        [row.seed for row in ours],
+        column(theirs, name),
+        [row.seed for row in theirs],
+        [row.training_seed for row in ours],
+        [row.training_seed for row in theirs],
+    )
+
+
+def shown(number: Estimate, digits: int = 2) -> str:
+    """Return an estimate with its interval."""
+    return f"{number.value:.{digits}f} [{number.low:.{digits}f}, {number.high:.{digits}f}]"
+
+
+def report(rows: list[EpisodeRow], config: Config, command: str) -> str:
+    """Return the tables as Markdown."""
+    lines = [
+        "# Scores",
+        "",
+        f"Recipe `{config.recipe}`; shipped data of lane-3-density-2 mixed at p = {config.mix.p:g}, {config.mix.size} "
+        f"transitions; {config.distill.iterations} gradient steps offline for every method, {config.adapt.steps} "
+        "environment steps online for every method that has any. Last checkpoint, test spawns, means with 95 % "
+        "intervals (hierarchical bootstrap over training seeds and spawns).",
+        "",
+        f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
+    ]
+    for scenario in dict.fromkeys(row.scenario for row in rows):
+        here = [row for row in rows if row.scenario == scenario]
+        clean = {
+            name: [row for row in here if row.agent == name and row.attack == "none"]
+            for name in dict.fromkeys(row.agent for row in here)
+        }
+        lines += ["", f"## {scenario}", "", "```", summary_text(here), "```", ""]
+        teacher = next((name for name, of in clean.items() if of and of[0].kind == "teacher"), None)
+        for name, other in (("RAPID", "slower"), ("RAPID", teacher), ("distilled", teacher), ("RAPID", "distilled")):
+            if other in clean and name in clean:
+                gain = difference(clean[name], clean[other])
+                crash = difference(clean[name], clean[other], "crashed")
+                lines.append(f"- {name} against {other}, paired: return {shown(gain)}, crash share {shown(crash, 3)}.")
+        if {"RAPID", "slower", "planner"} <= clean.keys():
+            low, high = (float(np.mean(column(clean[name], "episode_return"))) for name in ("slower", "planner"))
+            reached = (float(np.mean(column(clean["RAPID"], "episode_return"))) - low) / (high - low)
+            lines.append(
+                f"- RAPID has gone {reached:.0%} of the way from always-slower to the planner; aimed at: "
+                f"{WAY.get(scenario, 0):.0%} within a million online steps."
+            )
+    return "\n".join(lines) + "\n"
+
+
+def table(work: Path, scenarios: list[str], spawns: int, config: Config, out: Path) -> None:
+    """Write what has been measured so far."""
+    seeds = set(spawn_seeds("test", spawns))
+    rows = [
+        row
+        for row in load_rows(out / "floors.parquet")
+        if row.agent in FLOORS and row.seed in seeds and row.scenario in scenarios
+    ]
+    own = [row for path in sorted(work.glob(f"**/rows/*-{spawns}-*.parquet")) for row in load_rows(path)]
+    if not own:
+        raise SystemExit(f"Nothing has been measured over {spawns} spawns under '{work}'. Train first: see --help.")
+    save_rows(out / "scores.parquet", own)
+    rows = sorted(rows + own, key=lambda row: scenarios.index(row.scenario))
+    write_text(out / "scores.md", report(rows, config, " ".join(["python", "benchmarks/scores.py", *sys.argv[1:]])))
+    print(f"Wrote {out / 'scores.md'}")
+
+
+def main() -> None:
+    """Train, measure, and write the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2, 3, 4], help="training seeds")
+    parser.add_argument("--spawns", type=int, default=200, help="test spawns per agent")
+    parser.add_argument("--scenarios", nargs="+", default=list(PAPER_SCENARIOS), help="target scenarios")
+    parser.add_argument("--recipe", default="strong", choices=("strong", "paper"), help="how things are trained")
+    parser.add_argument("--steps", type=int, default=0, help="online steps; by default the recipe's")
+    parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")
+    parser.add_argument("--out", type=Path, default=Path("results"), help="where the table goes")
+    parser.add_argument("--teacher", action="store_true", help="drive the default teacher as well; it needs its model")
+    parser.add_argument("--table", action="store_true", help="only write the table of what is there")
+    chosen = parser.parse_args()
+    config = preset(chosen.recipe, "full")
+    config = replace(config, evaluate=replace(config.evaluate, curve_spawns=0))
+    if chosen.steps:
+        config = replace(config, adapt=replace(config.adapt, steps=chosen.steps))
+    work = chosen.work / chosen.recipe
+    if not chosen.table:
+        pipeline.check(config)
+        if chosen.teacher:
+            measure_teacher(work, chosen.scenarios, chosen.spawns)
+        for seed in chosen.seeds:
+            own = replace(config, seed=seed)
+            home = work / f"seed-{seed}"
+            if not (home / "mix" / "dataset.json").exists():
+                data = Path(pipeline.__file__).parent / "shipped" / "lane-3-density-2"
+                home.mkdir(parents=True, exist_ok=True)
+                pipeline.mix_datasets(own, data / "teacher", data / "random", home / "mix")
+            measure(own, train(own, home / "mix", home, chosen.scenarios), home, chosen.spawns)
+    table(work, chosen.scenarios, chosen.spawns, config, chosen.out)
+
+
+if __name__ == "__main__":
+    main()
