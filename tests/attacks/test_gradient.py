@@ -144,10 +144,10 @@ def test_random_starts_are_uniform_in_the_ball(roads):
     flat = lambda x: x[:, :5, 0] * 0  # noqa: E731
     labels = torch.eye(5)[:1].expand(2000, 5)
     generator = torch.Generator().manual_seed(0)
-    cube = (maximize_loss(flat, obs, labels, SCALE, RobustConfig("linf"), 1.0, generator) - obs) / SCALE
+    cube = (maximize_loss(flat, obs, labels, SCALE, RobustConfig("linf", 0.1), 1.0, generator) - obs) / SCALE
     assert cube[..., 1:].mean().abs() < 1e-3
     assert cube[..., 1:].std() == pytest.approx(0.1 / math.sqrt(3), rel=0.02)
-    ball = (maximize_loss(flat, obs, labels, SCALE, RobustConfig("l2"), 1.0, generator) - obs) / SCALE
+    ball = (maximize_loss(flat, obs, labels, SCALE, RobustConfig("l2", 0.1), 1.0, generator) - obs) / SCALE
     # In 60 dimensions the share of the volume within radius r is r^60.
     inside = (length(ball, "l2") / 0.1) ** 60
     assert inside.mean() == pytest.approx(0.5, abs=0.03)
