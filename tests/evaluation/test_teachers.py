@@ -136,7 +136,7 @@ def test_driving_measures_what_rollouts_do_and_what_was_said():
     assert sum(progress) == 6 * 30
     assert all(amount > 0 for amount in progress)
     assert {row.teacher for row in rows} == {"my rule"}
-    assert drive_teacher(Scripted("rule-forecast", 3, 0), "r", SCENARIO, seeds[:2], 2)[0].unlike_rule == 0
+    assert drive_teacher(Scripted("rule-foresight", 3, 0), "r", SCENARIO, seeds[:2], 2)[0].unlike_rule == 0
 
     faulty = Faulty()
     (row,) = drive_teacher(faulty, "faulty", SCENARIO, seeds[:1], 1)

@@ -51,14 +51,17 @@ def test_where_nothing_can_be_written_kernels_still_run(tmp_path: Path, monkeypa
 
 
 def test_a_change_of_any_kernel_makes_all_cached_kernels_stale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for path in Path(compiling.__file__).parent.glob("*.py"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    monkeypatch.setattr(compiling, "__file__", str(tmp_path / "compile.py"))
+    package = Path(compiling.__file__).parents[1]
+    for path in package.rglob("*.py"):
+        copy = tmp_path / path.relative_to(package)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+    monkeypatch.setattr(compiling, "__file__", str(tmp_path / "simulator" / "compile.py"))
     stamp = compiling.kernel_stamp.__wrapped__
     before = stamp()
     assert before == compiling.kernel_stamp()
-    (tmp_path / "env.py").write_text("# holds no kernel")
+    (tmp_path / "simulator" / "env.py").write_text("# holds none")
     assert stamp() == before
-    with (tmp_path / "behavior.py").open("a") as file:
+    with (tmp_path / "simulator" / "behavior.py").open("a") as file:
         file.write("\n")
     assert stamp() != before
