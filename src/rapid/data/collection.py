@@ -16,7 +16,7 @@ from typing import Any
 
 from rapid.data.dataset import DATASET_FILE, Dataset, load_dataset, save_dataset
 from rapid.data.driving import Budget, Collecting, MakeWorlds, SpentError, Tally
-from rapid.data.journal import exclusive
+from rapid.data.journal import check_settings, exclusive
 from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
 from rapid.errors import RapidError
 from rapid.files import read_json, write_json, write_text
@@ -137,12 +137,7 @@ def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
         before = read_json(work / "settings.json", "record of the collection")
     elif (work / "journal.jsonl").exists() or any(work.glob("part-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
-    if before is not None and before != settings:
-        wrong = [name for name in settings if before.get(name) != settings[name]]
-        raise RapidError(
-            f"'{root}' was collected with other settings: {', '.join(wrong)} differ. Choose another directory, or use "
-            "the same settings to go on."
-        )
+    check_settings(root, before, settings)
     if dataset is None or not dataset.collection or not dataset.collection["complete"]:
         if dataset is not None and not (work / "settings.json").exists():
             _reopen(dataset, work)

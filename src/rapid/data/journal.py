@@ -131,3 +131,17 @@ def exclusive(path: Path) -> Generator[None, None, None]:
                 "collect, `--shard i/n`."
             ) from error
         yield
+
+
+def check_settings(root: Path, before: dict[str, Any] | None, settings: dict[str, Any]) -> None:
+    """Raise unless a collection in `root` was begun with these settings, or (None) not begun.
+
+    Raises:
+        RapidError: the settings differ; the message names them.
+    """
+    if before is not None and before != settings:
+        wrong = [name for name in settings if before.get(name) != settings[name]]
+        raise RapidError(
+            f"'{root}' was collected with other settings: {', '.join(wrong)} differ. Choose another directory, or use "
+            "the same settings to go on."
+        )

@@ -19,7 +19,7 @@ import pyarrow as pa
 from rapid.data.collection import collect, identity
 from rapid.data.dataset import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE, Dataset, join, load_dataset, save_dataset
 from rapid.data.driving import Budget, MakeWorlds, SpentError, Tally
-from rapid.data.journal import exclusive
+from rapid.data.journal import check_settings, exclusive
 from rapid.data.transitions import SOURCES, concatenate
 from rapid.engines import Engine, Report, check_engine, run_jobs
 from rapid.errors import RapidError
@@ -291,12 +291,7 @@ def _check_same(root: Path, settings: dict[str, Any], dataset: Dataset | None) -
         before = (dataset.collection or {}).get("settings", {})
     elif any(work.glob("shard-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
-    if before is not None and before != settings:
-        wrong = [name for name in settings if before.get(name) != settings[name]]
-        raise RapidError(
-            f"'{root}' was collected with other settings: {', '.join(wrong)} differ. Choose another directory, or use "
-            "the same settings to go on."
-        )
+    check_settings(root, before, settings)
 
 
 def _split(dataset: Dataset, work: Path) -> None:
