@@ -25,7 +25,7 @@ from rapid.evaluation.teacher_summary import (
     teachers_markdown,
     teachers_text,
 )
-from rapid.evaluation.teachers import TeacherRow, drive_teacher, load_teacher_rows, save_teacher_rows
+from rapid.evaluation.teachers import SCHEMA, TeacherRow, drive_teacher, load_teacher_rows, save_teacher_rows
 from rapid.files import read_json, sha256, write_json, write_text
 from rapid.progress import task
 from rapid.report.figures import save_figure, teachers_figure
@@ -260,6 +260,7 @@ def _key(entrant: Entrant, scenario: str, seeds: Sequence[int], config: Config) 
         # Thresholds of the facts, by which all are judged, and the words of the prompts.
         "prompt": prompt_version(get_scenario(scenario).lanes),
         "versions": versions()["rapid-driving"],
+        "columns": SCHEMA.names,
     }
     readable = "".join(c if c.isalnum() or c in "-." else "-" for c in f"{scenario}-{Path(entrant.spec).name}")[:80]
     return f"{readable}-{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:12]}"

@@ -54,9 +54,8 @@ def row(teacher: str, seed: int, **changes) -> TeacherRow:
         "headway": 1.5,
         "decision_seconds": 0.1,
     }
-    counts = dict.fromkeys(
-        ("unsafe", "lane_changes", "flaps", "close_steps", "unlike_rule", "repaired", "fallbacks", "retries"), 0
-    )
+    names = ("unsafe", "lane_changes", "flaps", "close_steps", "unlike_foresight", "unlike_forecast")
+    counts = dict.fromkeys((*names, "repaired", "fallbacks", "retries"), 0)
     tokens = {"tokens_in": 100, "tokens_out": 10, "cost": 0.5}
     return TeacherRow(teacher=teacher, scenario=SCENARIO, seed=seed, **{**values, **counts, **tokens, **changes})
 
@@ -86,8 +85,8 @@ def test_choices_are_judged_by_what_the_observation_tells():
     found = judge(episode([blocked, free, free, free], [FASTER, IDLE, FASTER]), 3)
     assert found["had_safe"] == 3
     assert found["unsafe"] == 1
-    # On a free road the rule speeds up; with a car in the way it does not.
-    assert found["unlike_rule"] == 2
+    # On a free road both rules speed up; with a car in the way they do not.
+    assert found["unlike_foresight"] == found["unlike_forecast"] == 2
     # Nothing is safe here, so nothing chosen is held against the driver.
     boxed = scene((6, 1, 0), (6, 0, 0), (6, 2, 0), (-6, 0, 20), (-6, 2, 20), speed=28.0)
     assert judge(episode([boxed, boxed], [SLOWER]), 3)["had_safe"] == 0
@@ -136,7 +135,8 @@ def test_driving_measures_what_rollouts_do_and_what_was_said():
     assert sum(progress) == 6 * 30
     assert all(amount > 0 for amount in progress)
     assert {row.teacher for row in rows} == {"my rule"}
-    assert drive_teacher(Scripted("rule-foresight", 3, 0), "r", SCENARIO, seeds[:2], 2)[0].unlike_rule == 0
+    for rule, column in (("rule-foresight", "unlike_foresight"), ("rule-forecast", "unlike_forecast")):
+        assert getattr(drive_teacher(Scripted(rule, 3, 0), "r", SCENARIO, seeds[:2], 2)[0], column) == 0
 
     faulty = Faulty()
     (row,) = drive_teacher(faulty, "faulty", SCENARIO, seeds[:1], 1)

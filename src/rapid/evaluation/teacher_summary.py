@@ -45,8 +45,10 @@ class TeacherSummary:
     """Mean time headway, s, over the steps with a car ahead."""
     repaired_share: float
     fallback_share: float
-    unlike_rule_share: float
+    unlike_foresight_share: float
     """Of decisions, those that differ from what `rule-foresight` takes in the same scene."""
+    unlike_forecast_share: float
+    """The same for `rule-forecast`."""
     decisions_per_second: float
     tokens: float
     """Read and written, an episode."""
@@ -97,7 +99,8 @@ def _summary(rows: Sequence[TeacherRow], first: Sequence[TeacherRow], resamples:
         headway=_ratio(sum(mean * steps for mean, steps in led), sum(steps for _, steps in led)),
         repaired_share=_ratio(total("repaired"), decisions),
         fallback_share=_ratio(total("fallbacks"), decisions),
-        unlike_rule_share=_ratio(total("unlike_rule"), decisions),
+        unlike_foresight_share=_ratio(total("unlike_foresight"), decisions),
+        unlike_forecast_share=_ratio(total("unlike_forecast"), decisions),
         decisions_per_second=_ratio(decisions, sum(row.decision_seconds * row.length for row in rows)),
         tokens=_ratio(total("tokens_in") + total("tokens_out"), len(rows)),
         cost=_ratio(total("cost"), len(rows)),
@@ -154,9 +157,8 @@ def _tables(
     for scenario in dict.fromkeys(summary.scenario for summary in summaries):
         drove = [["teacher", "return", "difference", "crash %", "difference", "speed m/s", "distance m", "headway s"]]
         drove[0] += [f"TTC < {CLOSE:g} s %", "flaps"]
-        decided = [
-            ["teacher", "unsafe %", "unlike rule %", "repaired %", "fallback %", "decisions/s", "tokens", "cost"]
-        ]
+        decided = [["teacher", "unsafe %", "unlike foresight %", "unlike forecast %", "repaired %", "fallback %"]]
+        decided[0] += ["decisions/s", "tokens", "cost"]
         for of in summaries:
             if of.scenario != scenario:
                 continue
@@ -178,7 +180,8 @@ def _tables(
                 [
                     of.teacher,
                     number(of.unsafe_share, 1, 100),
-                    number(of.unlike_rule_share, 1, 100),
+                    number(of.unlike_foresight_share, 1, 100),
+                    number(of.unlike_forecast_share, 1, 100),
                     number(of.repaired_share, 1, 100),
                     number(of.fallback_share, 1, 100),
                     number(of.decisions_per_second, 0 if of.decisions_per_second >= 100 else 2),
@@ -205,7 +208,8 @@ def _notes(summaries: Sequence[TeacherSummary]) -> str:
     return (
         f"Means over {spawns} spawn seeds, with 95 % bootstrap intervals; differences are to {first}, paired by spawn "
         "(crashes in percentage points). unsafe: choices that the forecast calls unsafe, of those where something safe "
-        "was available. unlike rule: choices other than rule-foresight's in the same scene. flaps: lane changes "
+        "was available. unlike foresight, unlike forecast: choices other than those of rule-foresight and of "
+        "rule-forecast in the same scene. flaps: lane changes "
         f"undone within {FLAP_WITHIN} decisions, per {EPISODE}. TTC: time to collision. headway: time to reach where "
         f"the car ahead is, each at most {LONGEST_HEADWAY:g} s. repaired: invalid answers put right on a second try; "
         "fallback: those that the rule replaced. tokens and cost: an episode."

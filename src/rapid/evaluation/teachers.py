@@ -28,6 +28,7 @@ from rapid.scenarios import LANE_LEFT, LANE_RIGHT, get_scenario
 from rapid.simulator import Simulator
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import Facts, gather
+from rapid.teacher.foresight import look_ahead
 from rapid.teacher.scene import read_scenes
 from rapid.teacher.scripted import Scripted
 
@@ -73,8 +74,10 @@ class TeacherRow:
     """States that decisions led to with a car ahead on the own lane."""
     headway: float
     """Mean time headway over those, s, bumper to bumper; each at most `LONGEST_HEADWAY`."""
-    unlike_rule: int
+    unlike_foresight: int
     """Choices that differ from what the rule with the same foresight (`rule-foresight`) takes in the same scene."""
+    unlike_forecast: int
+    """Choices that differ from what `rule-forecast` takes in the same scene."""
     repaired: int
     """Answers that were invalid and put right on a second try."""
     fallbacks: int
@@ -146,6 +149,8 @@ def drive_teacher(
     lanes = get_scenario(scenario).lanes
     duration = int(get_scenario(scenario).config()["duration"])
     rows: list[TeacherRow] = []
+    # Or a teacher that meets the scenes of the one before it would look fast.
+    look_ahead.cache_clear()
     for first in range(0, len(seeds), lockstep):
         worlds = Worlds(np.asarray(seeds[first : first + lockstep], np.int64), record=True)
         env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, autoreset=False)
@@ -214,7 +219,11 @@ def judge(recording: Recording, lanes: int) -> dict[str, Any]:
     """Return the fields of a row that follow from the observations and the actions of an episode."""
     before_TVF, after_TVF, actions = recording.obs_TVF[:-1], recording.obs_TVF[1:], recording.action_T.tolist()
     all_facts = [gather(scene) for scene in read_scenes(before_TVF, lanes)]
-    rule = Scripted("rule-foresight", lanes, 0).decide(before_TVF, [None] * len(actions))
+
+    def unlike(rule: str) -> int:
+        decisions = Scripted(rule, lanes, 0).decide(before_TVF, [None] * len(actions))
+        return sum(decision.action != action for decision, action in zip(decisions, actions, strict=True))
+
     had_safe = [any(map(facts.survives, facts.available)) for facts in all_facts]
     headways = time_headway(after_TVF)
     seen = headways[~np.isnan(headways)]
@@ -229,7 +238,8 @@ def judge(recording: Recording, lanes: int) -> dict[str, Any]:
         "close_steps": int((time_to_collision(after_TVF) < CLOSE).sum()),
         "lead_steps": len(seen),
         "headway": float(seen.mean()) if len(seen) else math.nan,
-        "unlike_rule": sum(decision.action != action for decision, action in zip(rule, actions, strict=True)),
+        "unlike_foresight": unlike("rule-foresight"),
+        "unlike_forecast": unlike("rule-forecast"),
     }
 
 

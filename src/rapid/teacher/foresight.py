@@ -85,8 +85,12 @@ class WayOn(NamedTuple):
     """Rewards on it, less the penalty for driving close. Comparable where `seconds` is the same."""
 
 
+@lru_cache(2048)
 def look_ahead(scene: Scene) -> tuple[WayOn, ...]:
-    """Return the best way on after each of the five actions."""
+    """Return the best way on after each of the five actions.
+
+    The last scenes are remembered: those who judge a choice ask again for what the chooser was told.
+    """
     rows = [(0.0, scene.side, scene.speed, scene.drift, scene.lane)]
     rows += [(car.ahead, car.side, car.speed, car.drift, car.toward) for car in scene.cars]
     if len(scene.cars) >= NUM_VEHICLES - 1:
