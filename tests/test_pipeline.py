@@ -79,6 +79,14 @@ def test_the_same_command_again_does_nothing(config: Config, finished: Path):
     assert sum("done before" in line for line in said) == len(pipeline.STEPS)
 
 
+def test_steps_of_another_commit_are_named(config: Config, finished: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(pipeline, "commit", lambda: "another")
+    said: list[str] = []
+    pipeline.run(config, finished, say=said.append)
+    (line,) = (line for line in said if "another commit" in line)
+    assert all(step in line for step in pipeline.STEPS)
+
+
 def test_other_settings_and_unknown_steps_are_refused(config: Config, finished: Path):
     with pytest.raises(RapidError, match="other settings"):
         pipeline.run(apply_overrides(config, {"seed": 1}), finished, say=lambda line: None)

@@ -32,6 +32,18 @@ def test_work_of_an_earlier_run_does_not_enter_the_estimate(monkeypatch: pytest.
     assert "95/100 steps  ETA 6.0 s" in stream.getvalue()
 
 
+def test_a_bar_forgets_the_pace_of_an_earlier_run():
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    with progress.task("collect", 100, "steps", Terminal()) as work:
+        work.skip(90)
+        assert work._bar is not None
+        (bar,) = work._bar.tasks
+        assert (bar.completed, bar.speed) == (90, None)
+
+
 def test_a_failed_task_prints_no_closing_line():
     stream = io.StringIO()
     with pytest.raises(ValueError, match="x"), progress.task("t", 1, "u", stream):

@@ -91,6 +91,10 @@ def _run_steps(config: Config, home: RunDirectory, restart: str, say: Callable[[
     }
     _warm_up(config, say)
     say(f"run {home.path}: {config.scenario}, recipe {config.recipe}, scale {config.scale}, seed {config.seed}")
+    now = commit()
+    earlier = [step for step in STEPS if home.is_done(step) and home.facts(step).get("commit", now) != now]
+    if earlier:
+        say(f"Done by another commit than today's ({now or 'unknown'}), and kept: {', '.join(earlier)}. --from redoes.")
     for number, step in enumerate(STEPS, 1):
         heading = f"[{number}/{len(STEPS)}] {step}"
         if home.is_done(step):
@@ -101,7 +105,7 @@ def _run_steps(config: Config, home: RunDirectory, restart: str, say: Callable[[
         facts = actions[step](config, home)
         if "note" in facts:
             say(facts["note"])
-        home.finish(step, time.monotonic() - start, commit=commit(), **facts)
+        home.finish(step, time.monotonic() - start, commit=now, **facts)
     say("\n" + (home.path / "evaluate" / "summary.txt").read_text(encoding="utf-8"))
     times = ", ".join(f"{step} {format_seconds(home.facts(step)['seconds'])}" for step in STEPS)
     say(f"time: {times}")

@@ -28,6 +28,9 @@ class Task:
         """Count units that an earlier run did; they do not enter the estimate of the time left."""
         self._skipped += amount
         self.advance(amount)
+        if self._bar is not None and self._bar_id is not None:
+            # A bar that is started anew forgets how fast it came here.
+            self._bar.reset(self._bar_id, completed=int(self.done))
 
     def advance(self, amount: float = 1) -> None:
         """Count `amount` more units as done."""
