@@ -134,7 +134,7 @@ def test_words_of_several_tokens_are_scored_whole(model):
 
 def test_scores_do_not_depend_on_the_batch(model):
     together = model.score("You drive.", USERS, "Action:", ["keep", "right"])[0]
-    model._scores.clear()
+    model.forget()
     alone = np.concatenate([model.score("You drive.", [user], "Action:", ["keep", "right"])[0] for user in USERS])
     np.testing.assert_allclose(together, alone, atol=1e-4)
 
@@ -178,6 +178,33 @@ def test_a_local_model_converses(gguf, world, tmp_path, monkeypatch):
     decision = make_teacher(config, 3).decide(world(), [None])[0]
     assert decision.status == "fallback"
     assert decision.tokens_out > 0
+
+
+def test_a_conversation_goes_on_from_what_was_computed(model, monkeypatch):
+    """Every turn is what a plain pass over the whole conversation gives, and reads only what is new."""
+    passes, forward = [], model._model.forward
+    monkeypatch.setattr(model._model, "forward", lambda **given: passes.append(given) or forward(**given))
+    messages = [{"role": "system", "content": "You drive."}, {"role": "user", "content": "Lane 2 of 3."}]
+    for turn in range(3):
+        passes.clear()
+        text, tokens_in, tokens_out = model.write(messages, 6)
+        whole = "".join(f"<|im_start|>{m['role']}\n{m['content']}<|im_end|>\n" for m in messages)
+        ids = torch.tensor([model._encode(f"{whole}<|im_start|>assistant\n")])
+        plain = model._model.generate(ids, do_sample=False, max_new_tokens=6, eos_token_id=2, pad_token_id=2)
+        assert model._tokenizer.decode(plain[0, ids.shape[1] :].tolist()) == text
+        assert (tokens_in, tokens_out) == (ids.shape[1], plain.shape[1] - ids.shape[1])
+        fresh = passes[0]["input_ids"].shape[1]
+        assert fresh < tokens_in - (30 if turn else 10)
+        messages += [{"role": "assistant", "content": text}, {"role": "user", "content": f"RESULT {turn}"}]
+
+
+def test_an_answer_does_not_depend_on_the_conversation_before(model):
+    def opening(lane):
+        return [{"role": "system", "content": "You drive."}, {"role": "user", "content": f"You are in lane {lane}."}]
+
+    alone = model.write(opening(2), 6)
+    model.write(opening(1), 6)
+    assert model.write(opening(2), 6) == alone
 
 
 class Fixed:
@@ -224,5 +251,5 @@ def test_the_default_model_tells_safe_from_unsafe_and_gives_the_same_bits_in_any
 
 def make_teacher_again(teacher, obs_BVF):
     """Decide with nothing remembered."""
-    teacher._model._scores.clear()
+    teacher._model.forget()
     return teacher.decide(obs_BVF, [None])[0]

@@ -57,6 +57,7 @@ class LocalModel:
         self._head: Tensor = self._model.get_output_embeddings().weight.detach()
         self._template = _TEMPLATES[template]
         self._prefixes: dict[str, Any] = {}
+        self._talk: tuple[list[int], Any] | None = None
         self._scores: OrderedDict[tuple[str, str, tuple[str, ...]], tuple[NDArray[np.float64], int]] = OrderedDict()
         gc.collect()
 
@@ -89,6 +90,10 @@ class LocalModel:
         while len(self._scores) > REMEMBERED:
             self._scores.popitem(last=False)
         return np.stack([found[key][0] for key in keys]), [found[key][1] for key in keys]
+
+    def forget(self) -> None:
+        """Drop the scores that are remembered, for whoever measures speed."""
+        self._scores.clear()
 
     def _suffix(self, user: str, opening: str) -> list[int]:
         return self._encode(user + self._template.end + self._begin("assistant") + opening)
@@ -151,21 +156,48 @@ class LocalModel:
         return hidden_BTD[torch.arange(len(rows)), last_B][: len(suffixes)], hidden_BTD
 
     @torch.no_grad()
-    def write(self, messages: Sequence[dict[str, Any]], limit: int) -> tuple[str, int, int]:
-        """Return the likeliest answer to a conversation, and the tokens read and written."""
+    def write(self, messages: Sequence[Message], limit: int) -> tuple[str, int, int]:
+        """Return the likeliest answer to a conversation, and the tokens read and written.
+
+        The first two messages are the system's and the user's. What was computed of the constant part and of the
+        conversation's earlier turns is not computed again; nothing else is kept, so that an answer does not depend on
+        which conversations came before.
+        """
         turns = [self._begin(_role(message)) + message["content"] + self._template.end for message in messages]
-        ids = torch.tensor([self._encode("".join(turns) + self._begin("assistant"))])
+        head = turns[0] + self._begin("user")
+        read = self._encode(head) + self._encode("".join(turns)[len(head) :] + self._begin("assistant"))
+        cache = self._begun(messages, read)
+        ids = torch.tensor([read])
         stop = self._tokenizer.token_to_id(self._template.stop)
         out = self._model.generate(
             ids,
             attention_mask=torch.ones_like(ids),
+            past_key_values=cache,
             do_sample=False,
             max_new_tokens=limit,
             eos_token_id=stop,
             pad_token_id=stop,
         )
+        self._talk = out[0].tolist(), cache
         written = out[0, ids.shape[1] :].tolist()
         return self._tokenizer.decode(written), ids.shape[1], len(written)
+
+    def _begun(self, messages: Sequence[Message], read: list[int]) -> Any:
+        """Return the key/value cache of how a conversation begins: its turns so far or, at first, the constant part."""
+        from transformers import DynamicCache
+
+        if len(messages) > 2 and self._talk is not None:
+            said, cache = self._talk
+            same = next((i for i, (a, b) in enumerate(zip(said, read, strict=False)) if a != b), len(said))
+        else:
+            same, layers = self._prefix(messages[0]["content"])
+            cache = DynamicCache()
+            for layer, (keys, values) in enumerate(layers):
+                cache.update(keys, values, layer)
+        surplus = cache.get_seq_length() - min(same, len(read) - 1)
+        if surplus > 0:
+            cache.crop(-surplus)
+        return cache
 
     @torch.no_grad()
     def _prefix(self, system: str) -> tuple[int, list[tuple[Tensor, Tensor]]]:
