@@ -209,6 +209,8 @@ class OptimizerConfig:
     transitions that `loss.robust_on` names."""
     learning_rate: float = 5e-4
     """Adam's step size."""
+    gate_rate: float = 1.0
+    """By what the step size of the zero gate is multiplied. A gate that stays small keeps the adapters out."""
     linear_decay: bool = True
     """Let the step size fall linearly to zero over the training."""
     batch_size: int = 64
@@ -559,6 +561,7 @@ def validate(config: Config) -> Config:
             (loss.robust.radius >= 0, f"{name}.loss.robust.radius", loss.robust.radius, "at least 0"),
             (loss.robust.steps >= 1, f"{name}.loss.robust.steps", loss.robust.steps, "at least 1"),
             (optimizer.learning_rate > 0, f"{name}.optimizer.learning_rate", optimizer.learning_rate, "above 0"),
+            (optimizer.gate_rate > 0, f"{name}.optimizer.gate_rate", optimizer.gate_rate, "above 0"),
             (optimizer.batch_size >= 1, f"{name}.optimizer.batch_size", optimizer.batch_size, "at least 1"),
             (optimizer.target_update >= 1, f"{name}.optimizer.target_update", optimizer.target_update, "at least 1"),
             (0 < optimizer.target_rate <= 1, f"{name}.optimizer.target_rate", optimizer.target_rate, "in (0, 1]"),

@@ -29,6 +29,19 @@ def test_steps_are_those_of_torch_bit_for_bit():
         assert all(map(torch.equal, ours, theirs))
 
 
+def test_a_parameter_may_have_a_step_size_of_its_own():
+    ours, theirs = weights(), weights()
+    adam = Adam(ours, [1.0, 20.0, 1.0])
+    groups = [{"params": [theirs[0], theirs[2]]}, {"params": [theirs[1]], "lr": 0.2}]
+    reference = torch.optim.Adam(groups, lr=0.01, fused=True)
+    for step in range(1, 9):
+        adam.step(gradients(step), 0.01)
+        for weight, gradient in zip(theirs, gradients(step), strict=True):
+            weight.grad = gradient
+        reference.step()
+        assert all(map(torch.equal, ours, theirs))
+
+
 @pytest.mark.parametrize("largest", [0.1, 100.0])
 def test_clipping_is_that_of_torch_bit_for_bit(largest):
     ours, theirs = gradients(1), weights()

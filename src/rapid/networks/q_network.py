@@ -121,6 +121,12 @@ class QNetwork(nn.Module):
         """What 1 means in each normalised feature (F,): metres and m/s."""
         return self.encoding.scale_F
 
+    @property
+    def gate(self) -> nn.Parameter | None:
+        """What lets the adapters in: the zero gate (N-1, V), or the weights (N,) of a mixture of actions."""
+        head = self.head
+        return head.mixture.gate_NV if isinstance(head, TokenHead) else head.weights_N
+
     def forward(self, obs_BVF: Tensor) -> Tensor:
         """Return the Q-values (B, A)."""
         return self.head(*self.encoding(obs_BVF))
@@ -193,13 +199,8 @@ def set_phase(network: QNetwork, phase: Phase, freeze_decoder: bool = False) -> 
     Raises:
         RapidError: `adapt` on a network without adapters, or `freeze_decoder` on one without a decoder.
     """
-    head = network.head
-    if isinstance(head, TokenHead):
-        first, *adapters = head.mixture.policies
-        gate: nn.Parameter | None = head.mixture.gate_NV
-    else:
-        first, *adapters = head.mlps
-        gate = head.weights_N
+    head, gate = network.head, network.gate
+    first, *adapters = head.mixture.policies if isinstance(head, TokenHead) else head.mlps
     if phase == "adapt" and not adapters:
         raise RapidError(
             f"A '{network.config.kind}' network with one policy has no adapter to train. "

@@ -16,13 +16,22 @@ EPSILON = 1e-8
 
 
 class Adam:
-    """Moves `parameters` in place by their gradients."""
+    """Moves `parameters` in place by their gradients.
 
-    def __init__(self, parameters: Sequence[Tensor]) -> None:
+    Args:
+        parameters: what is trained.
+        rates: by what each parameter's step size is multiplied; None is 1 for all.
+    """
+
+    def __init__(self, parameters: Sequence[Tensor], rates: Sequence[float] | None = None) -> None:
         # Detached, they share the parameters' memory and no step needs to say that it takes no gradient.
         self._weights = [parameter.detach() for parameter in parameters]
         self._mean = [torch.zeros_like(weight) for weight in self._weights]
         self._square = [torch.zeros_like(weight) for weight in self._weights]
+        # The kernel knows one step size, so there is a call for each rate.
+        self._groups: dict[float, list[int]] = {}
+        for index, rate in enumerate(rates or [1.0] * len(self._weights)):
+            self._groups.setdefault(rate, []).append(index)
         # One count for all: the kernel wants one for each weight, but they never differ.
         self._count = torch.zeros((), device=self._weights[0].device)
 
@@ -30,21 +39,22 @@ class Adam:
     def step(self, gradients: Sequence[Tensor], learning_rate: float) -> None:
         """Take one step of the size `learning_rate` down the gradients, one for each parameter."""
         self._count += 1
-        torch._fused_adam_(  # pyright: ignore[reportPrivateUsage]
-            self._weights,
-            list(gradients),
-            self._mean,
-            self._square,
-            [],
-            [self._count] * len(self._weights),
-            lr=learning_rate,
-            beta1=BETAS[0],
-            beta2=BETAS[1],
-            weight_decay=0.0,
-            eps=EPSILON,
-            amsgrad=False,
-            maximize=False,
-        )
+        for rate, group in self._groups.items():
+            torch._fused_adam_(  # pyright: ignore[reportPrivateUsage]
+                [self._weights[index] for index in group],
+                [gradients[index] for index in group],
+                [self._mean[index] for index in group],
+                [self._square[index] for index in group],
+                [],
+                [self._count] * len(group),
+                lr=rate * learning_rate,
+                beta1=BETAS[0],
+                beta2=BETAS[1],
+                weight_decay=0.0,
+                eps=EPSILON,
+                amsgrad=False,
+                maximize=False,
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that `load_state_dict` needs."""

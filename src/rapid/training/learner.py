@@ -35,13 +35,13 @@ class Learner:
         self.target = copy.deepcopy(network).requires_grad_(False)
         self.generator = generator
         self.updates = 0
-        self._trained: list[Tensor] = [parameter for parameter in network.parameters() if parameter.requires_grad]
+        trained = {name: parameter for name, parameter in network.named_parameters() if parameter.requires_grad}
+        self._trained: list[Tensor] = list(trained.values())
         # The same parameters of both networks; frozen ones never differ.
         targets = dict(self.target.named_parameters())
-        self._targets: list[Tensor] = [
-            targets[name] for name, parameter in network.named_parameters() if parameter.requires_grad
-        ]
-        self._adam = Adam(self._trained)
+        self._targets: list[Tensor] = [targets[name] for name in trained]
+        rates = [config.gate_rate if parameter is network.gate else 1.0 for parameter in self._trained]
+        self._adam = Adam(self._trained, rates)
         self._terms: list[Tensor] = []
 
     @property
