@@ -1,11 +1,11 @@
 """The scores: RAPID and its baselines over several training seeds, from the shipped data, beside floors and ceiling.
 
-For every seed: phase 2 on the mixture of the data's scenario (RAPID; MLPs by DQN, double DQN, CQL; behaviour cloning),
-then phase 3 in every target scenario (RAPID's adapter; a plain double-DQN MLP from scratch, the same number of steps),
-then all of them over the test spawns, clean and attacked. Everything finished is kept under `--work`: an interrupted
-call goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there:
-`scores.parquet` (raw rows), `scores.md`. Of the floors and the planner it shows the rows in `floors.parquet`, which
-drove the same spawns.
+For every scenario and seed: phase 2 on the mixture of the scenario's own data (RAPID; MLPs by DQN, double DQN, CQL;
+behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a plain double-DQN MLP from scratch),
+then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on the data of
+that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call goes on
+where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw rows),
+`scores.md`. Of the floors and the planner it shows the rows in `floors.parquet`, which drove the same spawns.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -59,58 +59,80 @@ def offline_recipes(config: Config) -> dict[str, Config]:
     }
 
 
-def train(config: Config, mixture: Path, work: Path, scenarios: Iterable[str]) -> dict[str, list[tuple[str, Path]]]:
-    """Train what is missing and return the agents to be measured in each scenario, as (name, directory)."""
+def train(config: Config, data: str, work: Path, scenario: str, budgets: Iterable[int]) -> list[tuple[str, Path]]:
+    """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
+
+    Args:
+        config: the settings.
+        data: the scenario whose shipped data is learned from.
+        work: where what is trained on this data with this seed is kept.
+        scenario: where the agents adapt and are measured.
+        budgets: online steps; each gives agents of its own.
+    """
+    mixture = work / "mix"
+    if not (mixture / "dataset.json").exists():
+        sets = Path(pipeline.__file__).parent / "shipped" / data
+        work.mkdir(parents=True, exist_ok=True)
+        pipeline.mix_datasets(config, sets / "teacher", sets / "random", mixture)
     agents: list[tuple[str, Path]] = []
     for name, settings in offline_recipes(config).items():
-        home = work / name.replace(" ", "-").replace(",", "")
+        home = work / file_name(name)
         if not (home / "agent" / "config.json").exists():
             pipeline.distill_agent(settings, mixture, home, name)
         agents.append((name, home / "agent"))
-    measured: dict[str, list[tuple[str, Path]]] = {}
-    from_scratch = replace(
-        config.adapt,
-        train="scratch",
-        exploration_start=1.0,
-        exploration_end=0.05,
-        loss=replace(config.adapt.loss, conservative_weight=0.0),
-        optimizer=replace(config.adapt.optimizer, learning_rate=5e-4),
-    )
-    for scenario in scenarios:
+    for steps in budgets:
+        adapt = replace(config.adapt, scenario=scenario, steps=steps)
+        from_scratch = replace(
+            adapt,
+            train="scratch",
+            exploration_start=1.0,
+            exploration_end=0.05,
+            offline_share=0.0,
+            loss=replace(adapt.loss, conservative_weight=0.0),
+            optimizer=replace(adapt.optimizer, learning_rate=5e-4),
+        )
         online = {
-            "RAPID": (replace(config.adapt, scenario=scenario), work / "distilled", mixture),
-            "online DDQN": (replace(from_scratch, scenario=scenario), work / "offline-DDQN", None),
+            f"RAPID, {short(steps)}": (adapt, work / "distilled", mixture),
+            f"online DDQN, {short(steps)}": (from_scratch, work / "offline-DDQN", None),
         }
-        measured[scenario] = list(agents)
-        for name, (settings, origin, data) in online.items():
-            home = work / f"{name.replace(' ', '-')}-{scenario}"
+        for name, (settings, origin, offline) in online.items():
+            home = work / scenario / file_name(name)
             if not (home / "agent" / "config.json").exists():
-                pipeline.adapt_agent(replace(config, adapt=settings), origin / "agent", data, home, name)
-            measured[scenario].append((name, home / "agent"))
-    return measured
+                pipeline.adapt_agent(replace(config, adapt=settings), origin / "agent", offline, home, name)
+            agents.append((name, home / "agent"))
+    return agents
 
 
-def measure(config: Config, measured: dict[str, list[tuple[str, Path]]], work: Path, spawns: int) -> None:
+def short(steps: int) -> str:
+    """Return a number of steps as it stands in an agent's name: 10K, 1M."""
+    return f"{steps // 1000}K" if steps < 1_000_000 else f"{steps / 1_000_000:g}M"
+
+
+def file_name(name: str) -> str:
+    """Return an agent's name as that of a file."""
+    return name.replace(" ", "-").replace(",", "")
+
+
+def measure(config: Config, agents: Iterable[tuple[str, Path]], work: Path, scenario: str, spawns: int) -> None:
     """Drive every agent that has not been driven."""
-    for scenario, agents in measured.items():
-        for name, directory in agents:
-            path = work / "rows" / f"{scenario}-{spawns}-{name.replace(' ', '-').replace(',', '')}.parquet"
-            if path.exists():
-                continue
-            agent = open_agent(str(directory), scenario, config.seed)
-            agent.name = name
-            with task(f"evaluate, {name}, {scenario}, seed {config.seed}", spawns * len(ATTACKS), "episodes") as work_:
-                rows = evaluate_agent(
-                    agent,
-                    scenario,
-                    spawn_seeds("test", spawns),
-                    ATTACKS,
-                    generator_seed=config.seed,
-                    training_seed=config.seed,
-                    commit=commit(),
-                    progress=work_.advance,
-                )
-            save_rows(path, rows)
+    for name, directory in agents:
+        path = work / "rows" / f"{scenario}-{spawns}-{file_name(name)}.parquet"
+        if path.exists():
+            continue
+        agent = open_agent(str(directory), scenario, config.seed)
+        agent.name = name
+        with task(f"evaluate, {name}, {scenario}, seed {config.seed}", spawns * len(ATTACKS), "episodes") as shown_:
+            rows = evaluate_agent(
+                agent,
+                scenario,
+                spawn_seeds("test", spawns),
+                ATTACKS,
+                generator_seed=config.seed,
+                training_seed=config.seed,
+                commit=commit(),
+                progress=shown_.advance,
+            )
+        save_rows(path, rows)
 
 
 def measure_teacher(work: Path, scenarios: Iterable[str], spawns: int) -> None:
@@ -143,15 +165,15 @@ def shown(number: Estimate, digits: int = 2) -> str:
     return f"{number.value:.{digits}f} [{number.low:.{digits}f}, {number.high:.{digits}f}]"
 
 
-def report(rows: list[EpisodeRow], config: Config, command: str) -> str:
+def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> str:
     """Return the tables as Markdown."""
     lines = [
         "# Scores",
         "",
-        f"Recipe `{config.recipe}`; shipped data of lane-3-density-2 mixed at p = {config.mix.p:g}, {config.mix.size} "
-        f"transitions; {config.distill.iterations} gradient steps offline for every method, {config.adapt.steps} "
-        "environment steps online for every method that has any. Last checkpoint, test spawns, means with 95 % "
-        "intervals (hierarchical bootstrap over training seeds and spawns).",
+        f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
+        f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
+        f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
+        "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
     ]
@@ -163,36 +185,51 @@ def report(rows: list[EpisodeRow], config: Config, command: str) -> str:
         }
         lines += ["", f"## {scenario}", "", "```", summary_text(here), "```", ""]
         teacher = next((name for name, of in clean.items() if of and of[0].kind == "teacher"), None)
-        for name, other in (("RAPID", "slower"), ("RAPID", teacher), ("distilled", teacher), ("RAPID", "distilled")):
+        adapted = [name for name in clean if name.startswith("RAPID")]
+        pairs = [("distilled", "slower"), ("distilled", teacher)]
+        for name in adapted:
+            pairs += [
+                (name, "slower"),
+                (name, teacher),
+                (name, "distilled"),
+                (name, name.replace("RAPID", "online DDQN")),
+            ]
+        for name, other in pairs:
             if other in clean and name in clean:
                 gain = difference(clean[name], clean[other])
                 crash = difference(clean[name], clean[other], "crashed")
                 lines.append(f"- {name} against {other}, paired: return {shown(gain)}, crash share {shown(crash, 3)}.")
-        if {"RAPID", "slower", "planner"} <= clean.keys():
+        if {"slower", "planner"} <= clean.keys():
             low, high = (float(np.mean(column(clean[name], "episode_return"))) for name in ("slower", "planner"))
-            reached = (float(np.mean(column(clean["RAPID"], "episode_return"))) - low) / (high - low)
-            lines.append(
-                f"- RAPID has gone {reached:.0%} of the way from always-slower to the planner; aimed at: "
-                f"{WAY.get(scenario, 0):.0%} within a million online steps."
-            )
+            for name in ["distilled", *adapted]:
+                if name in clean:
+                    reached = (float(np.mean(column(clean[name], "episode_return"))) - low) / (high - low)
+                    lines.append(
+                        f"- {name} has gone {reached:.0%} of the way from always-slower to the planner; aimed at: "
+                        f"{WAY.get(scenario, 0):.0%} within a million online steps."
+                    )
     return "\n".join(lines) + "\n"
 
 
-def table(work: Path, scenarios: list[str], spawns: int, config: Config, out: Path) -> None:
+def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Config, out: Path) -> None:
     """Write what has been measured so far."""
     seeds = set(spawn_seeds("test", spawns))
-    rows = [
-        row
-        for row in load_rows(out / "floors.parquet")
-        if row.agent in FLOORS and row.seed in seeds and row.scenario in scenarios
-    ]
-    own = [row for path in sorted(work.glob(f"**/rows/*-{spawns}-*.parquet")) for row in load_rows(path)]
+    floors = [row for row in load_rows(out / "floors.parquet") if row.agent in FLOORS and row.seed in seeds]
+    rows: list[EpisodeRow] = []
+    own: list[EpisodeRow] = []
+    for scenario in scenarios:
+        pattern = f"{data or scenario}/seed-*/rows/{scenario}-{spawns}-*.parquet"
+        paths = [work / "rows" / f"{scenario}-{spawns}-teacher.parquet", *sorted(work.glob(pattern))]
+        here = [row for path in paths if path.exists() for row in load_rows(path)]
+        own += here
+        rows += [row for row in floors if row.scenario == scenario] + here
     if not own:
         raise SystemExit(f"Nothing has been measured over {spawns} spawns under '{work}'. Train first: see --help.")
-    save_rows(out / "scores.parquet", own)
-    rows = sorted(rows + own, key=lambda row: scenarios.index(row.scenario))
-    write_text(out / "scores.md", report(rows, config, " ".join(["python", "benchmarks/scores.py", *sys.argv[1:]])))
-    print(f"Wrote {out / 'scores.md'}")
+    name = f"scores-from-{data}" if data else "scores"
+    save_rows(out / f"{name}.parquet", own)
+    command = " ".join(["python", "benchmarks/scores.py", *sys.argv[1:]])
+    write_text(out / f"{name}.md", report(rows, config, data, command))
+    print(f"Wrote {out / name}.md")
 
 
 def main() -> None:
@@ -202,7 +239,8 @@ def main() -> None:
     parser.add_argument("--spawns", type=int, default=200, help="test spawns per agent")
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER_SCENARIOS), help="target scenarios")
     parser.add_argument("--recipe", default="strong", choices=("strong", "paper"), help="how things are trained")
-    parser.add_argument("--steps", type=int, default=0, help="online steps; by default the recipe's")
+    parser.add_argument("--steps", type=int, nargs="+", default=[10_000, 100_000], help="online steps")
+    parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")
     parser.add_argument("--out", type=Path, default=Path("results"), help="where the table goes")
     parser.add_argument("--teacher", action="store_true", help="drive the default teacher as well; it needs its model")
@@ -210,22 +248,18 @@ def main() -> None:
     chosen = parser.parse_args()
     config = preset(chosen.recipe, "full")
     config = replace(config, evaluate=replace(config.evaluate, curve_spawns=0))
-    if chosen.steps:
-        config = replace(config, adapt=replace(config.adapt, steps=chosen.steps))
     work = chosen.work / chosen.recipe
     if not chosen.table:
         pipeline.check(config)
         if chosen.teacher:
             measure_teacher(work, chosen.scenarios, chosen.spawns)
         for seed in chosen.seeds:
-            own = replace(config, seed=seed)
-            home = work / f"seed-{seed}"
-            if not (home / "mix" / "dataset.json").exists():
-                data = Path(pipeline.__file__).parent / "shipped" / "lane-3-density-2"
-                home.mkdir(parents=True, exist_ok=True)
-                pipeline.mix_datasets(own, data / "teacher", data / "random", home / "mix")
-            measure(own, train(own, home / "mix", home, chosen.scenarios), home, chosen.spawns)
-    table(work, chosen.scenarios, chosen.spawns, config, chosen.out)
+            for scenario in chosen.scenarios:
+                data = chosen.data or scenario
+                own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
+                agents = train(own, data, home, scenario, chosen.steps)
+                measure(own, agents, home, scenario, chosen.spawns)
+    table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)
 
 
 if __name__ == "__main__":

@@ -260,7 +260,7 @@ class AdaptConfig:
     exploration_share: float = 0.2
     """Share of the steps over which epsilon falls."""
     offline_share: float = 0.5
-    """Share of each batch taken from the offline data."""
+    """Share of each batch taken from the offline data; whatever `loss.n_step`, over one step."""
     train: Literal["adapter", "all", "scratch"] = "adapter"
     """`adapter` is the method: policy 1 frozen. `all` fine-tunes every weight. `scratch` starts from new weights."""
     freeze_decoder: bool = False

@@ -84,7 +84,8 @@ def adapt(
     loss = config.loss
     learner = Learner(network, config.optimizer, loss, planned, torch_stream(seed, "adapt/attack", device))
     buffer = ReplayBuffer(config.buffer_size, worlds_count, loss.discount, loss.n_step, device)
-    sampler = OfflineSampler(offline, loss.discount, loss.n_step, device) if offline and offline_count else None
+    # Over several steps the offline rewards would be those of other drivers, half of them random.
+    sampler = OfflineSampler(offline, loss.discount, 1, device) if offline and offline_count else None
     rng = numpy_stream(seed, "adapt/exploration and batches")
     drive = Drive(make_worlds or _default_worlds(scenario), worlds_count, seed)
     steps = 0
