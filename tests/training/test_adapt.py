@@ -52,6 +52,21 @@ def test_training_twice_is_bit_equal(tmp_path, config):
     assert weights(train(tmp_path / "3", config, seed=4)) != weights(first)
 
 
+def test_offline_transitions_are_taken_over_one_step(tmp_path, monkeypatch):
+    taken = []
+
+    class Watched(online.OfflineSampler):
+        def sample(self, count, rng):
+            taken.append(super().sample(count, rng))
+            return taken[-1]
+
+    monkeypatch.setattr(online, "OfflineSampler", Watched)
+    train(tmp_path, MIXED)
+    once = set(DATA.reward_N.astype(np.float32).tolist())
+    assert MIXED.loss.n_step > 1
+    assert set(torch.cat([batch.reward_B for batch in taken]).tolist()) <= once
+
+
 @pytest.mark.parametrize(
     ("config", "stop"), [(CONFIG, 1), (CONFIG, 9), (CONFIG, 20), (MIXED, 12)], ids=["first", "early", "last", "mixed"]
 )
