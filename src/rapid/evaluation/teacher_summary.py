@@ -207,10 +207,10 @@ def _notes(summaries: Sequence[TeacherSummary]) -> str:
     first = summaries[0].teacher if summaries else NOT_RUN
     return (
         f"Means over {spawns} spawn seeds, with 95 % bootstrap intervals; differences are to {first}, paired by spawn "
-        "(crashes in percentage points). unsafe: choices that the forecast calls unsafe, of those where something safe "
-        "was available. unlike foresight, unlike forecast: choices other than those of rule-foresight and of "
-        "rule-forecast in the same scene. flaps: lane changes "
-        f"undone within {FLAP_WITHIN} decisions, per {EPISODE}. TTC: time to collision. headway: time to reach where "
-        f"the car ahead is, each at most {LONGEST_HEADWAY:g} s. repaired: invalid answers put right on a second try; "
-        "fallback: those that the rule replaced. tokens and cost: an episode."
+        "(crashes in percentage points). unsafe: choices after which every way on is foreseen to crash, of those "
+        "where another action had a way on. unlike foresight, unlike forecast: choices other than those of "
+        f"rule-foresight and of rule-forecast in the same scene. flaps: lane changes undone within {FLAP_WITHIN} "
+        f"decisions, per {EPISODE}. TTC: time to collision. headway: time to reach where the car ahead is, each at "
+        f"most {LONGEST_HEADWAY:g} s. repaired: invalid answers put right on a second try; fallback: those that the "
+        "rule replaced. tokens and cost: an episode."
     )
