@@ -48,10 +48,8 @@ def offline_recipes(config: Config) -> dict[str, Config]:
         optimizer = replace(mlp.distill.optimizer, algorithm=algorithm)
         return replace(mlp, distill=replace(mlp.distill, loss=loss, optimizer=optimizer))
 
-    calm = replace(config.distill, loss=replace(config.distill.loss, robust_weight=0.0))
     return {
         "distilled": config,
-        "distilled, no J_robust": replace(config, distill=calm),
         "offline DQN": trained(0.0, double=False),
         "offline DDQN": trained(0.0, double=True),
         "CQL": trained(1.0, double=False),
@@ -59,7 +57,22 @@ def offline_recipes(config: Config) -> dict[str, Config]:
     }
 
 
-def train(config: Config, data: str, work: Path, scenario: str, budgets: Iterable[int]) -> list[tuple[str, Path]]:
+def offline_ablations(config: Config) -> dict[str, Config]:
+    """Return the settings of RAPID distilled without one of its parts, by name."""
+
+    def without(**terms: float) -> Config:
+        return replace(config, distill=replace(config.distill, loss=replace(config.distill.loss, **terms)))
+
+    return {
+        "distilled, no J_robust": without(robust_weight=0.0),
+        "distilled, no CQL": without(conservative_weight=0.0),
+        "distilled, plain DQN": without(robust_weight=0.0, conservative_weight=0.0),
+    }
+
+
+def train(
+    config: Config, data: str, work: Path, scenario: str, budgets: Iterable[int], ablations: bool
+) -> list[tuple[str, Path]]:
     """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
 
     Args:
@@ -68,6 +81,7 @@ def train(config: Config, data: str, work: Path, scenario: str, budgets: Iterabl
         work: where what is trained on this data with this seed is kept.
         scenario: where the agents adapt and are measured.
         budgets: online steps; each gives agents of its own.
+        ablations: whether RAPID is trained without each of its parts as well.
     """
     mixture = work / "mix"
     if not (mixture / "dataset.json").exists():
@@ -75,7 +89,8 @@ def train(config: Config, data: str, work: Path, scenario: str, budgets: Iterabl
         work.mkdir(parents=True, exist_ok=True)
         pipeline.mix_datasets(config, sets / "teacher", sets / "random", mixture)
     agents: list[tuple[str, Path]] = []
-    for name, settings in offline_recipes(config).items():
+    offline_agents = offline_recipes(config) | (offline_ablations(config) if ablations else {})
+    for name, settings in offline_agents.items():
         home = work / file_name(name)
         if not (home / "agent" / "config.json").exists():
             pipeline.distill_agent(settings, mixture, home, name)
@@ -95,6 +110,11 @@ def train(config: Config, data: str, work: Path, scenario: str, budgets: Iterabl
             f"RAPID, {short(steps)}": (adapt, work / "distilled", mixture),
             f"online DDQN, {short(steps)}": (from_scratch, work / "offline-DDQN", None),
         }
+        if ablations:
+            online |= {
+                f"RAPID, {short(steps)}, fine-tuned whole": (replace(adapt, train="all"), work / "distilled", mixture),
+                f"RAPID, {short(steps)}, from scratch": (replace(adapt, train="scratch"), work / "distilled", mixture),
+            }
         for name, (settings, origin, offline) in online.items():
             home = work / scenario / file_name(name)
             if not (home / "agent" / "config.json").exists():
@@ -239,7 +259,8 @@ def main() -> None:
     parser.add_argument("--spawns", type=int, default=200, help="test spawns per agent")
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER_SCENARIOS), help="target scenarios")
     parser.add_argument("--recipe", default="strong", choices=("strong", "paper"), help="how things are trained")
-    parser.add_argument("--steps", type=int, nargs="+", default=[10_000, 100_000], help="online steps")
+    parser.add_argument("--steps", type=int, nargs="*", default=[10_000, 100_000], help="online steps; may be none")
+    parser.add_argument("--ablations", action="store_true", help="train RAPID without each of its parts as well")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")
     parser.add_argument("--out", type=Path, default=Path("results"), help="where the table goes")
@@ -257,7 +278,7 @@ def main() -> None:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
                 own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
-                agents = train(own, data, home, scenario, chosen.steps)
+                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations)
                 measure(own, agents, home, scenario, chosen.spawns)
     table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)
 
