@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fake_worlds import FakeTeacher, FakeWorlds, assert_equal
+from interruption import interrupted
 from rapid.data import collection, driving
 from rapid.data.collection import collect, parse_shard
 from rapid.data.dataset import Dataset, join, load_dataset
@@ -102,18 +103,9 @@ def test_interrupted_anywhere_it_ends_with_the_same_bytes(tmp_path, whole, seed)
 )
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_interrupted_while_writing_it_ends_with_the_same_bytes(tmp_path, whole, monkeypatch, module, name, when):
-    real = getattr(module, name)
-
-    def interrupted(*arguments):
-        if when == "after":
-            real(*arguments)
-        raise KeyboardInterrupt
-
     first, second = FakeTeacher(), FakeTeacher()
-    with monkeypatch.context() as patch:
-        patch.setattr(module, name, interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            run(tmp_path, first)
+    with interrupted(monkeypatch, module, name, when):
+        run(tmp_path, first)
     run(tmp_path, second)
     assert content(tmp_path) == whole[0]
     assert first.asked + second.asked == whole[1]
