@@ -137,7 +137,7 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
         "scenario": chosen.scenario,
         "shipped": {name: told[name] for name in ("prompts", "seconds")} | {"decisions": len(data)},
         "models": [],
-        "agents": [],
+        "agents": [measure_agent(path, spaced(obs_NVF, 256)) for path in chosen.agents],
     }
     prompts(obs_NVF[:1], lanes)
     scenes = spaced(obs_NVF, 128)
@@ -146,7 +146,6 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
         name, _, count = entry.partition(":")
         scenes = spaced(obs_NVF, int(count or 256))
         result["models"].append(measure_model(name, scenes, lanes, chosen.sizes, chosen.blocks))
-    result["agents"] = [measure_agent(path, spaced(obs_NVF, 256)) for path in chosen.agents]
     return result
 
 

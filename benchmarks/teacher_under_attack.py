@@ -172,10 +172,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--scenario", default="lane-3-density-2")
     parser.add_argument("--spawns", type=int, default=100, help="test spawns of each driver under each attack")
-    parser.add_argument("--scores", type=Path, default=Path("runs/scores/strong"), help="where the trained agents are")
+    parser.add_argument(
+        "--scores", type=Path, help="where the trained agents are; runs/scores/strong/SCENARIO if unsaid"
+    )
     parser.add_argument("--work", type=Path, default=Path("runs/teacher-under-attack"), help="where cells are kept")
     parser.add_argument("--out", type=Path, default=Path("results"), help="where the results go")
     chosen = parser.parse_args()
+    chosen.scores = chosen.scores or Path("runs/scores/strong") / chosen.scenario
     torch.set_num_threads(1)
     rows = [row for name, seed, agent in drivers(chosen) for row in drive(agent, name, seed, chosen)]
     save_rows(chosen.out / "teacher-under-attack.parquet", rows)
