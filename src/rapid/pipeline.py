@@ -439,7 +439,7 @@ def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]
 def _open(config: Config, spec: str, scenario: str) -> Any:
     if spec == TEACHER:
         return make_teacher(config.teacher, get_scenario(scenario).lanes, config.seed)
-    return open_agent(spec, scenario, config.seed)
+    return open_agent(spec, scenario, config.seed, config.device)
 
 
 def _measure(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+import rapid
 from rapid.errors import RapidError
 from rapid.evaluation import rollouts
 from rapid.evaluation.agents import kind_of, open_agent
@@ -190,6 +191,13 @@ def test_rows_of_cells_that_do_not_apply_are_left_out(toy, constant, monkeypatch
 def test_what_cannot_drive_is_named(toy, agent: Any, match: str) -> None:
     with pytest.raises(RapidError, match=match):
         run_episodes(agent, SCENARIO, [10])
+
+
+def test_a_saved_agent_goes_to_the_device(monkeypatch):
+    asked = []
+    monkeypatch.setattr(rapid, "load_agent", lambda directory, device: asked.append((directory, device)))
+    open_agent(".", SCENARIO, device="cuda")
+    assert asked == [(".", "cuda")]
 
 
 def test_bad_requests(toy, constant) -> None:

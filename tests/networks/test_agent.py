@@ -96,6 +96,8 @@ def test_missing_agents(tmp_path, saved):
         ({"lanes": "three"}, "damaged"),
         ({"lanes": True}, "damaged"),
         ({"lanes": 0}, "damaged"),
+        ({"lanes": 5}, "ranges"),
+        ({"ranges": [1.0, 100.0, 16.0, 80.0, 80.0]}, "ranges"),
         ({"network": None}, "damaged"),
         ({"metadata": None}, "damaged"),
         ({"network": {"wdith": 3}}, "wdith"),

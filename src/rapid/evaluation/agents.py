@@ -31,10 +31,11 @@ class Driver(Protocol):
         ...
 
 
-def open_agent(spec: str, scenario: str, seed: int = 0) -> Any:
+def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> Any:
     """Return the agent that `spec` names: a saved agent's directory, an ONNX file, or a driver's name.
 
-    `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are.
+    `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are; `device` is where a
+    saved agent's network goes.
 
     Raises:
         RapidError: `spec` is none of them.
@@ -48,7 +49,7 @@ def open_agent(spec: str, scenario: str, seed: int = 0) -> Any:
 
         return PlannerAgent()
     if Path(spec).is_dir():
-        return rapid.load_agent(spec)
+        return rapid.load_agent(spec, device)
     if Path(spec).suffix == ".onnx":
         from rapid.export import OnnxAgent
 

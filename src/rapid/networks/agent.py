@@ -14,6 +14,7 @@ from torch import Tensor
 from rapid import files
 from rapid.config import NetworkConfig, apply_overrides
 from rapid.errors import RapidError
+from rapid.networks.encoding import feature_scale
 from rapid.networks.q_network import Explanation, QNetwork, build_network
 from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
 
@@ -161,6 +162,12 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
     ):
         raise RapidError(
             f"The agent '{folder}' is damaged: {CONFIG_FILE} lacks network, lanes or metadata. Save it again."
+        )
+    ranges = feature_scale(lanes).tolist()
+    if config.get("ranges") != ranges:
+        raise RapidError(
+            f"The agent '{folder}' reads features in ranges {config.get('ranges')}, but on {lanes} lanes this program "
+            f"has {ranges}. Use the program's version that wrote it, or train it again."
         )
     settings = apply_overrides(NetworkConfig(), config["network"], "network", f"'{folder / CONFIG_FILE}'")
     network = build_network(settings, lanes, seed=0)
