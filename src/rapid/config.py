@@ -393,7 +393,7 @@ def _resize(config: Config) -> Config:
             lockstep=4 if tiny else 16,
         ),
         mix=replace(config.mix, size=int(min(teacher / config.mix.p, random / (1 - config.mix.p)))),
-        distill=replace(config.distill, iterations=40 if tiny else 800, evaluate_every=20 if tiny else 200),
+        distill=replace(config.distill, iterations=40 if tiny else 1_500, evaluate_every=20 if tiny else 300),
         adapt=replace(
             config.adapt,
             steps=200 if tiny else 8_000,
