@@ -372,7 +372,7 @@ def _paper(config: Config) -> Config:
             exploration_end=0.05,
             offline_share=0.0,
             learning_starts=32,
-            loss=replace(loss, conservative_weight=0.0, robust_weight=0.0, n_step=1),
+            loss=replace(loss, conservative_weight=0.0, robust_weight=0.0),
             optimizer=optimizer,
         ),
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fake_worlds import FakeTeacher, FakeWorlds, assert_equal
+from interruption import interrupted
 from rapid.data import sharding
 from rapid.data.collection import collect
 from rapid.data.dataset import Dataset, join, load_dataset
@@ -79,17 +80,8 @@ def test_interrupted_anywhere_it_ends_with_the_same_bytes(tmp_path, whole, seed)
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_interrupted_while_it_is_extended_it_ends_with_the_same_data(tmp_path, whole, monkeypatch, name, when):
     run(tmp_path, 40)
-    real = getattr(sharding, name)
-
-    def interrupted(*arguments):
-        if when == "after":
-            real(*arguments)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(sharding, name, interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            run(tmp_path)
+    with interrupted(monkeypatch, sharding, name, when):
+        run(tmp_path)
     run(tmp_path)
     assert content(tmp_path) == whole
 
