@@ -21,6 +21,9 @@ import numpy as np
 
 from rapid import pipeline
 from rapid.config import Config, TeacherConfig, preset
+from rapid.data.dataset import load_dataset, save_dataset
+from rapid.data.relabel import relabel
+from rapid.data.shipped import dataset_folder
 from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import evaluate_agent
@@ -35,8 +38,8 @@ from rapid.teacher import make_teacher
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
-WAY = {"lane-3-density-2": 0.75, "lane-4-density-2.5": 0.70, "lane-5-density-3": 0.50}
-"""The share of the way from always-slower to the planner that is aimed at."""
+WAY = {3: 0.75, 4: 0.70, 5: 0.50}
+"""The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
 
 def offline_recipes(config: Config) -> dict[str, Config]:
@@ -85,9 +88,9 @@ def train(
     """
     mixture = work / "mix"
     if not (mixture / "dataset.json").exists():
-        sets = Path(pipeline.__file__).parent / "shipped" / data
+        teacher, random = datasets(data, work.parent)
         work.mkdir(parents=True, exist_ok=True)
-        pipeline.mix_datasets(config, sets / "teacher", sets / "random", mixture)
+        pipeline.mix_datasets(config, teacher, random, mixture)
     agents: list[tuple[str, Path]] = []
     offline_agents = offline_recipes(config) | (offline_ablations(config) if ablations else {})
     for name, settings in offline_agents.items():
@@ -121,6 +124,19 @@ def train(
                 pipeline.adapt_agent(replace(config, adapt=settings), origin / "agent", offline, home, name)
             agents.append((name, home / "agent"))
     return agents
+
+
+def datasets(scenario: str, work: Path) -> tuple[Path, Path]:
+    """Return where the teacher's and the random data of a scenario lie; under `work` if its reward is another."""
+    driven = replace(get_scenario(scenario), reward="normalized").name
+    folders: list[Path] = []
+    for name in ("teacher", "random"):
+        shipped = f"shipped:{driven}/{name}"
+        folder = dataset_folder(shipped) if driven == scenario else work / name
+        if not (folder / "dataset.json").exists():
+            save_dataset(relabel(load_dataset(shipped), scenario), folder)
+        folders.append(folder)
+    return folders[0], folders[1]
 
 
 def short(steps: int) -> str:
@@ -226,7 +242,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
                     reached = (float(np.mean(column(clean[name], "episode_return"))) - low) / (high - low)
                     lines.append(
                         f"- {name} has gone {reached:.0%} of the way from always-slower to the planner; aimed at: "
-                        f"{WAY.get(scenario, 0):.0%} within a million online steps."
+                        f"{WAY.get(get_scenario(scenario).lanes, 0):.0%} within a million online steps."
                     )
     return "\n".join(lines) + "\n"
 

@@ -85,6 +85,18 @@ class Collect:
 
 
 @dataclass(frozen=True)
+class Relabel:
+    """Give a collected dataset the rewards of another scenario on the same road: its episodes are driven again."""
+
+    dataset: Annotated[Positional[str], arg(metavar="DATASET")]
+    """Directory of the dataset, whole as it was collected."""
+    scenario: str = f"{Config.scenario}:progress"
+    """Whose rewards are wanted."""
+    out: str = "data/relabelled"
+    """Directory of the dataset with these rewards."""
+
+
+@dataclass(frozen=True)
 class Mix:
     """Mix a teacher's and a random dataset into one, transition by transition."""
 
@@ -345,17 +357,40 @@ def _collect(options: Collect, config: Config) -> int:
     return 0
 
 
+def _relabel(options: Relabel, config: Config) -> int:
+    from rapid.data.dataset import load_dataset, save_dataset
+    from rapid.data.relabel import relabel
+    from rapid.progress import task
+
+    out = _new_folder(options.out)
+    dataset = load_dataset(options.dataset)
+    with task("relabel", len(dataset), "transitions") as progress:
+        save_dataset(relabel(dataset, options.scenario, progress), out)
+    print(f"{len(dataset)} transitions in {options.out}")
+    return 0
+
+
 def _mix(options: Mix, config: Config) -> int:
     from rapid import pipeline
 
-    out = Path(options.out)
+    out = _new_folder(options.out)
+    mixed = pipeline.mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
+    print(f"{len(mixed)} transitions in {options.out}")
+    return 0
+
+
+def _new_folder(path: str) -> Path:
+    """Return the path if nothing is there yet.
+
+    Raises:
+        RapidError: there is something.
+    """
+    out = Path(path)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RapidError(
             f"'{out}' exists and is not an empty directory. Choose another --out, so that nothing is overwritten."
         )
-    mixed = pipeline.mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
-    print(f"{len(mixed)} transitions in {options.out}")
-    return 0
+    return out
 
 
 def _distill(options: Distill, config: Config) -> int:
@@ -472,6 +507,7 @@ def _doctor(options: Doctor, config: Config) -> int:
 _VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "run": (Run, _run),
     "collect": (Collect, _collect),
+    "relabel": (Relabel, _relabel),
     "mix": (Mix, _mix),
     "distill": (Distill, _distill),
     "adapt": (Adapt, _adapt),
