@@ -1,10 +1,11 @@
 """A Q-network as an ONNX graph of standard operators, written node by node.
 
-Tracing gives a correct graph of twice as many nodes, and at batch 1 it is their number that takes the time. What can be
-computed from the weights alone is computed here: units go into the first layer's weights, the scale of the scores into
-the queries', closed adapters are left out.
+Tracing gives a correct graph of three times as many nodes, and at batch 1 it is their number that takes the time. What
+can be computed from the weights alone is computed here: units go into the first layer's weights, attention is
+multiplied out, what the action token asks for is a constant, closed adapters are left out.
 
-Shapes: B batch, V vehicles, F features, D width, N policies, A actions, H heads, T tokens. Rows are (B*T, D).
+Shapes: B batch, V vehicles, F features of the network, G of the graph, D width, N policies, A actions, H heads, T
+tokens. Rows are (B*T, D).
 """
 
 from typing import Any, cast
@@ -93,48 +94,54 @@ def build_model(network: QNetwork) -> Any:
 
 def _q_values(graph: Graph, network: QNetwork) -> str:
     head, encoding = network.head, network.encoding
-    features, unit_F = "obs", np.ones(NUM_FEATURES, np.float32)
+    features, read_GF = "obs", np.eye(NUM_FEATURES, dtype=np.float32)
     if encoding.kind == "normalized":
-        unit_F = _array(encoding.scale_F)
+        read_GF /= _array(encoding.scale_F)
     elif encoding.kind in ("ego", "near"):
         ego = graph.cut("obs", 0, 1, 1)
-        features, unit_F = (
-            graph.node("Sub", "obs", graph.node("Mul", ego, _array(encoding.relative_VF))),
-            _array(encoding.unit_F),
-        )
+        features = graph.node("Sub", "obs", graph.node("Mul", ego, _array(encoding.relative_VF)))
+        read_GF /= _array(encoding.unit_F)
         if encoding.kind == "near":
-            features = graph.node("Concat", features, *_near(graph, features), axis=-1)
-            unit_F = np.append(unit_F, np.ones(NEAR_FEATURES, np.float32))
+            features = _near(graph, features)
+            read_GF = _read_near(read_GF)
     present = None
     if encoding.mask_absent:
         present = graph.node("Greater", graph.cut("obs", 0, 1, 2), _array(encoding.absent_V1))
     if isinstance(head, MlpHead):
         if present:
             features = graph.node("Where", present, features, 0.0)
-        return _mlps(graph, head, features, unit_F)
+        return _mlps(graph, head, features, read_GF)
     # What the rows of absent vehicles hold has no influence: the mask hides them, and none of them is read.
     mask = graph.reshape(graph.node("Where", present, 0.0, -np.inf), -1, 1, 1, NUM_VEHICLES) if present else None
-    return _decoder(graph, head.decoder, _mixture(graph, head.mixture, features, unit_F, mask), mask)
+    return _decoder(graph, head.decoder, _mixture(graph, head.mixture, features, read_GF, mask), mask)
 
 
-def _near(graph: Graph, relative: str) -> tuple[str, str, str]:
-    """Return what `near` adds to the ego-relative features, each (B, V, 1)."""
-    ahead, aside, faster = (graph.cut(relative, place, place + 1, 2) for place in (1, 2, 3))
+def _near(graph: Graph, relative: str) -> str:
+    """Return ego-relative features (B, V, F), the same divided by the distance, and `beside`, next to each other."""
+    ahead, aside = graph.cut(relative, 1, 2, 2), graph.cut(relative, 2, 3, 2)
     distance = graph.node("Add", graph.node("Abs", ahead), NEAR)
-    share = graph.node("Mul", aside, 1 / BESIDE)
-    beside = graph.node("Exp", graph.node("Neg", graph.node("Mul", share, share)))
-    return graph.node("Div", ahead, distance), beside, graph.node("Div", faster, distance)
+    beside = graph.node("Exp", graph.node("Mul", graph.node("Mul", aside, aside), -1 / BESIDE**2))
+    return graph.node("Concat", relative, graph.node("Div", relative, distance), beside, axis=-1)
 
 
-def _mlps(graph: Graph, head: MlpHead, features: str, unit_F: Array) -> str:
-    flat, total = graph.reshape(features, -1, NUM_VEHICLES * len(unit_F)), ""
+def _read_near(read_FF: Array) -> Array:
+    """Return how the features of `near` are read off what :func:`_near` gives: of the quotients, x's and vx's count."""
+    read_GF = np.zeros((2 * NUM_FEATURES + 1, NUM_FEATURES + NEAR_FEATURES), np.float32)
+    read_GF[:NUM_FEATURES, :NUM_FEATURES] = read_FF
+    share, beside, closing = range(NUM_FEATURES, NUM_FEATURES + NEAR_FEATURES)
+    read_GF[NUM_FEATURES + 1, share] = read_GF[NUM_FEATURES + 3, closing] = read_GF[-1, beside] = 1
+    return read_GF
+
+
+def _mlps(graph: Graph, head: MlpHead, features: str, read_GF: Array) -> str:
+    flat, total = graph.reshape(features, -1, NUM_VEHICLES * len(read_GF)), ""
     weights_N = [1.0] if head.weights_N is None else _array(head.weights_N).tolist()
     for mlp, weight in zip(head.mlps, weights_N, strict=True):
         layers = [layer for layer in cast(nn.Sequential, mlp) if isinstance(layer, nn.Linear)]
         rows = flat
         for index, layer in enumerate(layers):
             last, matrix = index == len(layers) - 1, _array(layer.weight).T
-            matrix = matrix / np.tile(unit_F, NUM_VEHICLES)[:, None] if index == 0 else matrix
+            matrix = np.kron(np.eye(NUM_VEHICLES, dtype=np.float32), read_GF) @ matrix if index == 0 else matrix
             share = np.float32(weight if last else 1.0)
             rows = graph.node("Gemm", rows, matrix * share, _array(layer.bias) * share)
             rows = rows if last else graph.node("Relu", rows)
@@ -142,14 +149,14 @@ def _mlps(graph: Graph, head: MlpHead, features: str, unit_F: Array) -> str:
     return total
 
 
-def _mixture(graph: Graph, mixture: MixtureOfPolicies, features: str, unit_F: Array, mask: str | None) -> str:
+def _mixture(graph: Graph, mixture: MixtureOfPolicies, features: str, read_GF: Array, mask: str | None) -> str:
     """Return the mixed tokens (B, V, D)."""
     first, *adapters = (cast(PolicyEncoder, policy) for policy in mixture.policies)
-    tokens = _policy(graph, first, features, unit_F, mask)
+    tokens = _policy(graph, first, features, read_GF, mask)
     if mixture.router is None:
         return tokens
     into, _, out = mixture.router
-    hidden = graph.node("MatMul", features, _array(cast(nn.Linear, into).weight).T / unit_F[:, None])
+    hidden = graph.node("MatMul", features, read_GF @ _array(cast(nn.Linear, into).weight).T)
     hidden = graph.node("Relu", graph.node("Add", hidden, _array(cast(nn.Linear, into).bias)))
     logits = graph.node("MatMul", hidden, _array(cast(nn.Linear, out).weight).T)
     logits = graph.node("Add", logits, _array(cast(nn.Linear, out).bias))
@@ -171,7 +178,7 @@ def _mixture(graph: Graph, mixture: MixtureOfPolicies, features: str, unit_F: Ar
         share = graph.cut(weights, 0, 1, 2)
     mixed = graph.node("Mul", tokens, share)
     for index in opened:
-        tokens = _policy(graph, adapters[index - 1], features, unit_F, mask)
+        tokens = _policy(graph, adapters[index - 1], features, read_GF, mask)
         part = graph.node("Mul", tokens, graph.cut(weights, index, index + 1, 2))
         mixed = graph.node("Add", mixed, part)
     return mixed
@@ -189,14 +196,14 @@ def _top_k(graph: Graph, logits: str, policies: int, kept: int) -> str:
     return graph.node("Concat", own, closed, axis=-1)
 
 
-def _policy(graph: Graph, policy: PolicyEncoder, features: str, unit_F: Array, mask: str | None) -> str:
+def _policy(graph: Graph, policy: PolicyEncoder, features: str, read_GF: Array, mask: str | None) -> str:
     """Return the policy's tokens (B, V, D)."""
     width = policy.projection.out_features
     bias_VD = np.tile(_array(policy.projection.bias), (NUM_VEHICLES, 1))
     if policy.position is not None:
         position = _array(cast(Tensor, policy.position))
         bias_VD[: len(position)] += position
-    tokens = graph.node("MatMul", features, _array(policy.projection.weight).T / unit_F[:, None])
+    tokens = graph.node("MatMul", features, read_GF @ _array(policy.projection.weight).T)
     rows = graph.reshape(graph.node("Add", tokens, bias_VD), -1, width)
     rows = _transformer(graph, policy.transformer, rows, NUM_VEHICLES, mask)
     return graph.reshape(rows, -1, NUM_VEHICLES, width)
@@ -204,55 +211,111 @@ def _policy(graph: Graph, policy: PolicyEncoder, features: str, unit_F: Array, m
 
 def _decoder(graph: Graph, decoder: ActionDecoder, tokens: str, mask: str | None) -> str:
     """Return the Q-values (B, A)."""
-    length, width = NUM_VEHICLES, decoder.head.in_features
+    length, width, first_D = NUM_VEHICLES, decoder.head.in_features, None
     if decoder.action_token is not None:
-        length += 1
+        length, first_D = length + 1, _array(decoder.action_token)[0, 0]
         pads = graph.constant([0, 1, 0, 0, 0, 0], np.int64)
         token_TD = np.zeros((length, width), np.float32)
-        token_TD[0] = _array(decoder.action_token)[0, 0]
+        token_TD[0] = first_D
         tokens = graph.node("Add", graph.node("Pad", tokens, pads), token_TD)
         if mask:
             mask = graph.node("Pad", mask, graph.constant([0, 0, 0, 1, 0, 0, 0, 0], np.int64))
     rows = graph.reshape(tokens, -1, width)
-    return graph.linear(_transformer(graph, decoder.transformer, rows, length, mask, first_only=True), decoder.head)
+    blocks = [cast(Block, block) for block in decoder.transformer.blocks]
+    for block in blocks[:-1]:
+        rows = _block(graph, block, rows, length, mask)
+    # Before the first layer the action token is the same whatever is seen.
+    rows = _first_of_block(graph, blocks[-1], rows, length, mask, first_D if len(blocks) == 1 else None)
+    return graph.linear(graph.norm(rows, decoder.transformer.norm), decoder.head)
 
 
-def _transformer(
-    graph: Graph, transformer: Transformer, rows: str, length: int, mask: str | None, first_only: bool = False
-) -> str:
-    blocks = [cast(Block, block) for block in transformer.blocks]
-    for index, block in enumerate(blocks):
-        rows = _block(graph, block, rows, length, mask, first_only and index == len(blocks) - 1)
+def _transformer(graph: Graph, transformer: Transformer, rows: str, length: int, mask: str | None) -> str:
+    for block in transformer.blocks:
+        rows = _block(graph, cast(Block, block), rows, length, mask)
     return graph.norm(rows, transformer.norm)
 
 
-def _block(graph: Graph, block: Block, rows: str, length: int, mask: str | None, first_only: bool) -> str:
-    """Return the rows after the layer; with `first_only` each sample's first."""
-    heads, width = block.heads, block.attention_norm.normalized_shape[0]
-    size = width // heads
-    weight, bias = _array(block.query_key_value.weight).T.copy(), _array(block.query_key_value.bias).copy()
-    weight[:, :width] *= np.float32(size**-0.5)
-    bias[:width] *= np.float32(size**-0.5)
+class _Attention:
+    """The weights of a block's attention, multiplied out.
+
+    Scores are q k' = (x Wq + bq) (x Wk + bk)'. What is the same for every key has no influence after the softmax,
+    which leaves (x Wq Wk' + bq Wk') x': the tokens themselves are the keys. And since a softmax sums to 1, they are the
+    values too: P (x Wv + bv) Wo + bo = (P x) Wv Wo + (bv Wo + bo). Two projections are left of four.
+    """
+
+    def __init__(self, block: Block) -> None:
+        weight = block.query_key_value.weight.detach().cpu().double().numpy()
+        bias = block.query_key_value.bias.detach().cpu().double().numpy()
+        out = block.attention_out.weight.detach().cpu().double().numpy()
+        heads, width = block.heads, weight.shape[1]
+        size = width // heads
+        query_HSD, key_HSD, value_HSD = weight.reshape(3, heads, size, width)
+        query_HS, _, value_HS = bias.reshape(3, heads, size)
+        out_HSD = out.T.reshape(heads, size, width)
+        self.heads, self.width = heads, width
+        self.ask_DE = np.einsum("hsd,hse->dhe", query_HSD, key_HSD).reshape(width, -1) / size**0.5
+        """Tokens (., D) to queries (., H*D)."""
+        self.ask_E = np.einsum("hs,hse->he", query_HS, key_HSD).reshape(-1) / size**0.5
+        self.give_ED = np.einsum("hsd,hse->hde", value_HSD, out_HSD).reshape(-1, width)
+        """What the heads attended to (., H*D) to the block's tokens (., D)."""
+        self.give_D = np.einsum("hs,hsd->d", value_HS, out_HSD) + _array(block.attention_out.bias)
+
+
+def _block(graph: Graph, block: Block, rows: str, length: int, mask: str | None) -> str:
+    """Return the rows (B*T, D) after the layer."""
+    attention = _Attention(block)
     normed = graph.norm(rows, block.attention_norm)
-    query = ""
-    if first_only:
-        rows, first = (_first(graph, value, length, width) for value in (rows, normed))
-        query = graph.reshape(graph.node("Gemm", first, weight[:, :width], bias[:width]), -1, heads, 1, size)
-        weight, bias = weight[:, width:], bias[width:]
-    parts = weight.shape[1] // width
-    split = graph.reshape(graph.node("Gemm", normed, weight, bias), -1, length, parts * heads, size)
-    projected = graph.node("Split", graph.node("Transpose", split, perm=[0, 2, 1, 3]), outputs=parts, axis=1)
-    if not first_only:
-        query, *projected = projected
-    key, value = projected
-    scores = graph.node("MatMul", query, graph.node("Transpose", key, perm=[0, 1, 3, 2]))
+    asked = graph.node("Gemm", normed, _float(attention.ask_DE), _float(attention.ask_E))
+    query = _heads_first(graph, asked, length, attention)
+    attended = _attend(graph, query, normed, length, mask, attention)
+    if attention.heads > 1:
+        attended = graph.node("Transpose", attended, perm=[0, 2, 1, 3])
+    attended = graph.reshape(attended, -1, attention.heads * attention.width)
+    attended = graph.node("Gemm", attended, _float(attention.give_ED), _float(attention.give_D))
+    return _feedforward(graph, block, graph.node("Add", rows, attended))
+
+
+def _first_of_block(graph: Graph, block: Block, rows: str, length: int, mask: str | None, first_D: Array | None) -> str:
+    """Return each sample's first row (B, D) after the layer; `first_D` is what it is before, if always the same."""
+    attention = _Attention(block)
+    normed = graph.norm(rows, block.attention_norm)
+    heads, width = attention.heads, attention.width
+    if first_D is None:
+        first = _first(graph, normed, length, width)
+        asked = graph.node("Gemm", first, _float(attention.ask_DE), _float(attention.ask_E))
+        query: str | Array = graph.reshape(asked, -1, heads, 1, width)
+    else:
+        norm = block.attention_norm
+        centred_D = (first_D - first_D.mean()) / np.sqrt(first_D.var() + norm.eps)
+        normed_D = centred_D * _array(norm.weight) + _array(norm.bias)
+        query = _float(normed_D @ attention.ask_DE + attention.ask_E).reshape(1, heads, 1, width)
+    attended = _attend(graph, query, normed, length, mask, attention)
+    attended = graph.reshape(attended, -1, heads * width)
+    bias_D = attention.give_D if first_D is None else attention.give_D + first_D
+    attended = graph.node("Gemm", attended, _float(attention.give_ED), _float(bias_D))
+    if first_D is None:
+        attended = graph.node("Add", _first(graph, rows, length, width), attended)
+    return _feedforward(graph, block, attended)
+
+
+def _heads_first(graph: Graph, rows: str, length: int, attention: _Attention) -> str:
+    """Return rows (B*T, H*D) as (B, H, T, D)."""
+    if attention.heads == 1:
+        return graph.reshape(rows, -1, 1, length, attention.width)
+    split = graph.reshape(rows, -1, length, attention.heads, attention.width)
+    return graph.node("Transpose", split, perm=[0, 2, 1, 3])
+
+
+def _attend(graph: Graph, query: str | Array, normed: str, length: int, mask: str | None, attention: _Attention) -> str:
+    """Return what the queries (B, H, ., D) attend to among the tokens (B*T, D), as (B, H, ., D)."""
+    tokens = graph.reshape(normed, -1, 1, length, attention.width)
+    scores = graph.node("MatMul", query, graph.node("Transpose", tokens, perm=[0, 1, 3, 2]))
     if mask:
         scores = graph.node("Add", scores, mask)
-    attended = graph.node("MatMul", graph.node("Softmax", scores, axis=-1), value)
-    if not first_only:
-        attended = graph.node("Transpose", attended, perm=[0, 2, 1, 3])
-    attended = graph.linear(graph.reshape(attended, -1, width), block.attention_out)
-    rows = graph.node("Add", rows, attended)
+    return graph.node("MatMul", graph.node("Softmax", scores, axis=-1), tokens)
+
+
+def _feedforward(graph: Graph, block: Block, rows: str) -> str:
     hidden = graph.node("Relu", graph.linear(graph.norm(rows, block.feedforward_norm), block.feedforward_in))
     return graph.node("Add", rows, graph.linear(hidden, block.feedforward_out))
 
@@ -264,3 +327,7 @@ def _first(graph: Graph, rows: str, length: int, width: int) -> str:
 
 def _array(tensor: Tensor) -> Array:
     return tensor.detach().cpu().numpy()
+
+
+def _float(array: NDArray[np.floating]) -> Array:
+    return array.astype(np.float32)
