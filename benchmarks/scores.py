@@ -134,7 +134,7 @@ def datasets(scenario: str, work: Path) -> tuple[Path, Path]:
         shipped = f"shipped:{driven}/{name}"
         folder = dataset_folder(shipped) if driven == scenario else work / name
         if not (folder / "dataset.json").exists():
-            save_dataset(relabel(load_dataset(shipped), scenario), folder)
+            save_dataset(relabel(load_dataset(shipped), get_scenario(scenario).reward), folder)
         folders.append(folder)
     return folders[0], folders[1]
 

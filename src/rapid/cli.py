@@ -13,7 +13,7 @@ from rapid.errors import RapidError, did_you_mean
 VERBS: dict[str, str] = {
     "run": "do everything: collect, mix, distill, adapt, evaluate, report",
     "collect": "phase 1: let a teacher drive and keep every step",
-    "relabel": "phase 1: give collected data the rewards of another scenario",
+    "relabel": "phase 1: give collected data the scenario's other reward",
     "mix": "phase 1: mix teacher and random transitions into one dataset",
     "distill": "phase 2: offline RL with the robust term, into a policy",
     "adapt": "phase 3: online DQN in the target scenario, the distilled policy frozen",

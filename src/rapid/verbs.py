@@ -26,7 +26,7 @@ from rapid.config import (
     TeacherConfig,
 )
 from rapid.errors import RapidError
-from rapid.scenarios import PAPER_SCENARIOS
+from rapid.scenarios import PAPER_SCENARIOS, Reward
 from rapid.tracking import Tracking
 
 T = TypeVar("T")
@@ -86,12 +86,12 @@ class Collect:
 
 @dataclass(frozen=True)
 class Relabel:
-    """Give a collected dataset the rewards of another scenario on the same road: its episodes are driven again."""
+    """Give a collected dataset the scenario's other reward: its episodes are driven again, action by action."""
 
     dataset: Annotated[Positional[str], arg(metavar="DATASET")]
     """Directory of the dataset, whole as it was collected."""
-    scenario: str = f"{Config.scenario}:progress"
-    """Whose rewards are wanted."""
+    reward: Reward = "progress"
+    """The reward that is wanted; `progress` counts distance and not crashing alone."""
     out: str = "data/relabelled"
     """Directory of the dataset with these rewards."""
 
@@ -365,7 +365,7 @@ def _relabel(options: Relabel, config: Config) -> int:
     out = _new_folder(options.out)
     dataset = load_dataset(options.dataset)
     with task("relabel", len(dataset), "transitions") as progress:
-        save_dataset(relabel(dataset, options.scenario, progress), out)
+        save_dataset(relabel(dataset, options.reward, progress), out)
     print(f"{len(dataset)} transitions in {options.out}")
     return 0
 

@@ -9,7 +9,7 @@ from rapid.data.dataset import Dataset
 from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
 from rapid.progress import Task
-from rapid.scenarios import IDLE, get_scenario
+from rapid.scenarios import IDLE, Reward, get_scenario
 
 WORLDS = 64
 """Episodes that are driven at once."""
@@ -17,27 +17,22 @@ TOLERANCE = 1e-3
 """Metres and m/s by which what is seen may differ from the record: another processor may round otherwise."""
 
 
-def relabel(dataset: Dataset, scenario: str, progress: Task | None = None) -> Dataset:
-    """Return the dataset with the rewards that its driving earns in `scenario`; nothing else changes.
+def relabel(dataset: Dataset, reward: Reward, progress: Task | None = None) -> Dataset:
+    """Return the dataset with the rewards that its driving earns under `reward`; nothing else changes.
 
     Teachers do not see the reward, so one collection serves every reward. Spawn seeds and actions give every episode
     again, and what is seen on the way is compared with the record.
 
     Args:
         dataset: whole episodes, as they were collected.
-        scenario: the same road, traffic and dynamics with another reward.
+        reward: which one is wanted.
         progress: counts transitions.
 
     Raises:
-        RapidError: another road, a mixture or another dataset with steps missing, or a record that the simulator does
-            not give again.
+        RapidError: a mixture or another dataset with steps missing, or a record that the simulator does not give again.
     """
-    before, after = get_scenario(dataset.scenario), get_scenario(scenario)
-    if replace(before, reward=after.reward) != after:
-        raise RapidError(
-            f"The dataset was driven in '{before.name}', of which '{after.name}' is not another reward but another "
-            f"road. Collect there, or name {replace(after, lanes=before.lanes, density=before.density).name}."
-        )
+    before = get_scenario(dataset.scenario)
+    after = replace(before, reward=reward)
     rows = dataset.transitions
     episodes = _whole_episodes(rows)
     reward_N = np.empty_like(rows.reward_N)
