@@ -26,6 +26,15 @@ def test_the_same_reward_gives_the_record_again_to_the_bit():
     assert_equal(relabel(dataset, "normalized").transitions, dataset.transitions)
 
 
+def test_a_crash_in_the_last_second_is_a_crash():
+    dataset = load_dataset("shipped:lane-4-density-2.5/random")
+    rows = dataset.transitions
+    last = rows.episode_N[rows.terminated_N & (rows.step_N == 29)]
+    assert len(last)
+    dataset = replace(dataset, transitions=rows.select(np.isin(rows.episode_N, last)), log=None)
+    assert_equal(relabel(dataset, "normalized").transitions, dataset.transitions)
+
+
 def test_the_rewards_are_those_of_driving_in_the_other_scenario():
     dataset = shipped(3)
     other = relabel(dataset, "progress")

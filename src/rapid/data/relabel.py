@@ -77,7 +77,8 @@ def _drive(rows: Transitions, episodes: list[NDArray[np.int64]], scenario: str, 
         obs_WVF, reward_W, terminated_W, truncated_W, _ = env.step(action_W)
         _compare(rows.next_obs_NVF[now], obs_WVF[worlds], scenario)
         _compare(rows.terminated_N[now], terminated_W[worlds], scenario)
-        _compare(rows.truncated_N[now], truncated_W[worlds], scenario)
+        # A crash in the last second is a crash: the record keeps one of the two.
+        _compare(rows.truncated_N[now], (truncated_W & ~terminated_W)[worlds], scenario)
         reward_N[now] = reward_W[worlds]
 
 
