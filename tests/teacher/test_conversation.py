@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher.conversation import ChatError, ConversingTeacher, Reply, ToolCall
+from rapid.teacher.conversation import ChatError, ConversingTeacher, Reply, Request, ToolCall
 from rapid.teacher.decision import Decision, to_record
 from rapid.teacher.facts import gather, safest
 from rapid.teacher.replay import Replay
@@ -87,6 +88,39 @@ def test_tools_are_called_in_plain_text(world):
     script = Script(Reply('CALL check_action {"action": "keep"}'), Reply(KEEP), native_tools=False)
     assert decide(script, world, "react").status == "ok"
     assert script.heard[1][-1]["content"].startswith("RESULT keep:")
+
+
+class Choir:
+    """A chat that answers together: each world calls as many tools as the lane it is in says, then decides."""
+
+    native_tools = False
+
+    def __init__(self):
+        self.asked = []
+
+    def ask_together(self, requests: Sequence[Request]) -> list[Reply]:
+        self.asked.append(len(requests))
+        return [self.reply(request.messages) for request in requests]
+
+    def ask(self, messages: Sequence[dict], tools: list[dict], schema: dict | None, logprobs: bool = False) -> Reply:
+        return self.reply(messages)
+
+    def reply(self, messages):
+        lane = int(messages[1]["content"].split("in lane ")[1][0])
+        called = sum(message["content"].startswith("RESULT") for message in messages)
+        text = "CALL available_lanes" if called < lane else KEEP.replace("calm road", f"lane {lane}")
+        return Reply(text, (), len(messages), 1)
+
+
+def test_worlds_are_led_in_lockstep_as_each_would_be_alone(crowd):
+    choir = Choir()
+    together = teacher(choir, "react").decide(crowd, [None] * len(crowd))
+    assert choir.asked[:2] == [24, 24]
+    assert choir.asked == sorted(choir.asked, reverse=True)
+    assert len({decision.explanation for decision in together}) == len(choir.asked) - 1 == 3
+    assert len({decision.seconds for decision in together}) == 1
+    alone = [teacher(Choir(), "react").decide(crowd[i : i + 1], [None])[0] for i in range(len(crowd))]
+    assert [replace(d, seconds=0) for d in together] == [replace(d, seconds=0) for d in alone]
 
 
 def test_endless_tool_calls_end(world):

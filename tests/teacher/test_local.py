@@ -8,9 +8,10 @@ import torch
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher import make_teacher, models
+from rapid.teacher import local, make_teacher, models
 from rapid.teacher.agent import ScoringTeacher, softmax_over
 from rapid.teacher.gguf import convert
+from rapid.teacher.int8 import Int8Linear
 from rapid.teacher.local import LocalModel
 from rapid.teacher.prompt import WORDS
 
@@ -182,12 +183,12 @@ def test_a_local_model_converses(gguf, world, tmp_path, monkeypatch):
 
 def test_a_conversation_goes_on_from_what_was_computed(model, monkeypatch):
     """Every turn is what a plain pass over the whole conversation gives, and reads only what is new."""
-    passes, forward = [], model._model.forward
-    monkeypatch.setattr(model._model, "forward", lambda **given: passes.append(given) or forward(**given))
+    passes, forward = [], model._model.base_model.forward
+    monkeypatch.setattr(model._model.base_model, "forward", lambda **given: passes.append(given) or forward(**given))
     messages = [{"role": "system", "content": "You drive."}, {"role": "user", "content": "Lane 2 of 3."}]
     for turn in range(3):
         passes.clear()
-        text, tokens_in, tokens_out = model.write(messages, 6)
+        [(text, tokens_in, tokens_out)] = model.write([messages], 6)
         whole = "".join(f"<|im_start|>{m['role']}\n{m['content']}<|im_end|>\n" for m in messages)
         ids = torch.tensor([model._encode(f"{whole}<|im_start|>assistant\n")])
         plain = model._model.generate(ids, do_sample=False, max_new_tokens=6, eos_token_id=2, pad_token_id=2)
@@ -202,9 +203,80 @@ def test_an_answer_does_not_depend_on_the_conversation_before(model):
     def opening(lane):
         return [{"role": "system", "content": "You drive."}, {"role": "user", "content": f"You are in lane {lane}."}]
 
-    alone = model.write(opening(2), 6)
-    model.write(opening(1), 6)
-    assert model.write(opening(2), 6) == alone
+    alone = model.write([opening(2)], 6)
+    model.write([opening(1)], 6)
+    assert model.write([opening(2)], 6) == alone
+
+
+def talks(lanes=(1, 22, 333, 4)):
+    return [
+        [{"role": "system", "content": "You drive."}, {"role": "user", "content": f"Lane {'9' * lane}."}]
+        for lane in lanes
+    ]
+
+
+def answered(messages, text):
+    return [*messages, {"role": "assistant", "content": text}, {"role": "user", "content": "RESULT " + "x" * len(text)}]
+
+
+def test_conversations_side_by_side_get_the_answers_that_each_gets_alone(model, monkeypatch):
+    """Over three turns, of which the second is asked of some only, as others have decided by then."""
+    monkeypatch.setattr(local, "TALKS", 3)
+    together = talks()
+    alone = dict(enumerate(talks()))
+    for numbers in ((0, 1, 2, 3), (1, 3), (3, 1)):
+        limit = 5 + len(numbers)
+        found = model.write([together[number] for number in numbers], limit)
+        model_talks, model._talks = model._talks, {}
+        for number, (text, tokens_in, tokens_out) in zip(numbers, found, strict=True):
+            # With nothing kept: each turn is computed anew.
+            assert model.write([alone[number]], limit) == [(text, tokens_in, tokens_out)]
+            assert 0 < tokens_out <= limit
+            alone[number] = answered(alone[number], text)
+            together[number] = answered(together[number], text)
+            model._talks = {}
+        model._talks = model_talks
+
+
+def test_what_is_finished_is_not_gone_on_with(model):
+    opening = talks()
+    whole = model.write(opening, 8)
+    cut = model.write(opening, 8, lambda text: len(text) >= 3)
+    for (full, *_), (text, _, tokens) in zip(whole, cut, strict=True):
+        assert full.startswith(text)
+        assert 3 <= len(text) < len(full)
+        assert tokens < 8
+
+
+def test_a_cut_answer_is_gone_on_from_as_it_was_cut(model):
+    opening = talks((5,))[0]
+    text = model.write([opening], 8, lambda text: len(text) >= 3)[0][0]
+    kept = model.write([answered(opening, text)], 6)
+    model._talks = {}
+    assert model.write([answered(opening, text)], 6) == kept
+
+
+def test_rounded_layers_are_near_and_do_not_depend_on_the_batch():
+    generator = torch.Generator().manual_seed(0)
+    layer = torch.nn.Linear(64, 48)
+    rounded = Int8Linear(layer)
+    inputs_BTK = torch.randn(5, 3, 64, generator=generator) * torch.logspace(-2, 3, 5)[:, None, None]
+    with torch.no_grad():
+        outputs_BTN, exact_BTN = rounded(inputs_BTK), layer(inputs_BTK)
+        error_BT = (outputs_BTN - exact_BTN).norm(dim=-1) / exact_BTN.norm(dim=-1)
+        assert error_BT.max() < 0.03
+        alone_BTN = torch.stack([torch.stack([rounded(row_K) for row_K in row_TK]) for row_TK in inputs_BTK])
+    assert torch.equal(outputs_BTN, alone_BTN)
+    assert torch.equal(rounded(torch.zeros(64)), layer.bias)
+
+
+def test_a_model_that_writes_may_be_rounded(gguf, tmp_path, monkeypatch):
+    convert(gguf[0], tmp_path / "tiny")
+    monkeypatch.setattr("rapid.teacher.int8.is_fast", lambda: True)
+    rounded = LocalModel(tmp_path / "tiny", rounded=True)
+    assert not any(isinstance(layer, torch.nn.Linear) for layer in rounded._model.modules())
+    together = rounded.write(talks(), 6)
+    assert together == [rounded.write([messages], 6)[0] for messages in talks()]
 
 
 class Fixed:

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from rapid.scenarios import ACTIONS, FASTER, IDLE
-from rapid.teacher.briefing import briefing, read_call, read_choice
+from rapid.teacher.briefing import briefing, is_finished, read_call, read_choice
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import gather
 from rapid.teacher.prompt import WORDS, calibration, digest, digest_system, prompt_version
@@ -98,6 +98,38 @@ def test_calls_in_plain_text():
     assert read_call('I look.\nCALL cars_on_lane {"lane": 2}\n') == ("cars_on_lane", '{"lane": 2}')
     assert read_call("CALL available_actions") == ("available_actions", "{}")
     assert read_call("I could CALL a friend") is None
+    assert read_call('CALL forecast_action({"action": "right"})\nCALL b') == ("forecast_action", '{"action": "right"}')
+    assert read_call('Well.\nforecast_action {"action": "faster"}') == ("forecast_action", '{"action": "faster"}')
+    assert read_call("available_lanes") == ("available_lanes", "{}")
+    assert read_call("available_lanes are 1 and 2") is None
+    assert read_call("CALL cars_on_lane(2)") == ("cars_on_lane", "2")
+    assert read_call("CALL available_actions()") == ("available_actions", "{}")
+
+
+@pytest.mark.parametrize(
+    ("text", "done"),
+    [
+        ("I look.\nCALL cars_on", False),
+        ("CALL available_lanes", False),
+        ("CALL available_lanes\n", True),
+        ('CALL check_action {"action": "keep"', False),
+        ('CALL check_action {"action": "keep"}', True),
+        ('CALL check_action({"action": "keep"}', True),
+        ('{"explanation": "calm", "action": "ke', False),
+        ('{"explanation": "calm", "action": "keep"}', True),
+        ('Lane {"lane": 2} is free.', False),
+        ("", False),
+    ],
+)
+def test_a_whole_call_or_decision_is_noticed_while_it_is_written(text, done):
+    assert is_finished(text) == done
+
+
+def test_in_react_style_the_cars_are_to_be_asked_for(facts):
+    told, asked = (briefing(facts, None, style, False).user for style in ("digest", "react"))
+    assert all(car.name in told for car in facts.scene.cars)
+    assert [car.name for car in facts.scene.cars if car.name in asked] == ["car 2"]
+    assert asked.endswith("Possible actions: left, keep, right, faster, slower. Which do you forecast first?")
 
 
 @pytest.mark.parametrize(

@@ -138,12 +138,11 @@ def make_model_teacher(config: TeacherConfig, lanes: int, seed: int) -> Teacher:
     from rapid.teacher.models import dense_folder
 
     folder, digest_sha256, template = dense_folder(config.model)
-    model = LocalModel(folder, template)
+    writes = config.style == "react" or len(memory) > 0 or config.reflect
+    model = LocalModel(folder, template, rounded=writes)
     identity = {**identity, "weights_sha256": digest_sha256}
-    if config.style == "react" or len(memory) or config.reflect:
-        # One conversation after the other: they would compete for the same cores.
-        chat = LocalChat(model, config.max_answer_tokens)
-        return ConversingTeacher(chat, dataclasses.replace(config, concurrency=1), identity, lanes, memory)
+    if writes:
+        return ConversingTeacher(LocalChat(model, config.max_answer_tokens), config, identity, lanes, memory)
     return ScoringTeacher(
         model, identity, lanes, stream_seed(seed, "teacher/shuffle") if config.shuffle_facts else None
     )

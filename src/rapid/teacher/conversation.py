@@ -2,15 +2,18 @@
 
 In `digest` style one word is asked for, so that the probabilities of the tokens at that place, where a server gives
 them, are a soft label. In `react` style the decision follows from what was said before it and is certain by then.
+
+Each conversation is a generator that yields what it asks. Those with a server run in threads; those with a model in
+this process run in lockstep, so that the model answers all that wait at once.
 """
 
 import dataclasses
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +29,7 @@ from rapid.teacher.briefing import (
     read_call,
     read_choice,
     repair_request,
+    tool_result,
 )
 from rapid.teacher.decision import Decision
 from rapid.teacher.experience import Experience
@@ -80,8 +84,20 @@ class Reply:
     """The tokens of `text` with their probabilities, where they were asked for and given."""
 
 
+@dataclass(frozen=True)
+class Request:
+    """What a model is asked: to answer a conversation."""
+
+    messages: Sequence[Message]
+    tools: list[dict[str, Any]]
+    schema: dict[str, Any] | None
+    """The form that the answer should have."""
+    logprobs: bool = False
+    """Whether the probabilities of the answer's tokens are wanted."""
+
+
 class Chat(Protocol):
-    """A model that answers a conversation."""
+    """A model that answers one conversation at a time, and several at once from threads."""
 
     @property
     def native_tools(self) -> bool:
@@ -102,6 +118,42 @@ class Chat(Protocol):
             RapidError: none will ever be had: a wrong key, address or model.
         """
         ...
+
+
+@runtime_checkable
+class BatchChat(Protocol):
+    """A model that answers many conversations together."""
+
+    @property
+    def native_tools(self) -> bool:
+        """See :class:`Chat`."""
+        ...
+
+    def ask_together(self, requests: Sequence[Request]) -> list[Reply]:
+        """Answer every request; see :meth:`Chat.ask`."""
+        ...
+
+
+T = TypeVar("T")
+Conversation = Generator[Request, Reply | ChatError, T]
+"""Yields what it asks, is sent the answer or what went wrong, and returns what came of it."""
+
+
+def converse(
+    conversations: Sequence[Conversation[T]], answer: Callable[[Sequence[Request]], Sequence[Reply | ChatError]]
+) -> list[T]:
+    """Lead conversations in lockstep to their ends: all that wait for an answer are answered together."""
+    results: dict[int, T] = {}
+    answers: dict[int, Any] = dict.fromkeys(range(len(conversations)))
+    while answers:
+        waiting: dict[int, Request] = {}
+        for number, said in answers.items():
+            try:
+                waiting[number] = conversations[number].send(said)
+            except StopIteration as end:
+                results[number] = end.value
+        answers = dict(zip(waiting, answer(list(waiting.values())), strict=True)) if waiting else {}
+    return [results[number] for number in range(len(conversations))]
 
 
 @dataclass
@@ -127,14 +179,26 @@ def _opening(prompt: Prompt) -> list[Message]:
     return [{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}]
 
 
+def _answer(chat: Chat, request: Request) -> Reply | ChatError:
+    try:
+        return chat.ask(request.messages, request.tools, request.schema, request.logprobs)
+    except ChatError as error:
+        return error
+
+
 class ConversingTeacher:
-    """Asks a chat model, world by world, several at once; reminds it of similar situations, if there is a memory.
+    """Asks a chat model about many worlds at once; reminds it of similar situations, if there is a memory.
 
     `memory` is only read. It implements :class:`rapid.teacher.memory.Reflective` too.
     """
 
     def __init__(
-        self, chat: Chat, config: TeacherConfig, identity: dict[str, Any], lanes: int, memory: Memory | None = None
+        self,
+        chat: Chat | BatchChat,
+        config: TeacherConfig,
+        identity: dict[str, Any],
+        lanes: int,
+        memory: Memory | None = None,
     ) -> None:
         shots = f", {config.few_shot}-shot" if config.few_shot else ""
         self.name = f"{config.model} ({config.style}{shots})"
@@ -164,8 +228,11 @@ class ConversingTeacher:
             RapidError: also if the server refuses the key or the model, or seems to be down.
         """
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
-        with ThreadPoolExecutor(max(self._config.concurrency, 1)) as pool:
-            decisions = list(pool.map(self._decide, all_facts, previous))
+        start = time.perf_counter()
+        decisions = list(self._converse([self._decide(*given) for given in zip(all_facts, previous, strict=True)]))
+        if isinstance(self._chat, BatchChat):
+            seconds = (time.perf_counter() - start) / max(len(decisions), 1)
+            decisions = [dataclasses.replace(decision, seconds=seconds) for decision in decisions]
         for decision in decisions:
             lost = decision.status == "fallback" and decision.error.startswith("no answer")
             self._watch(decision.error if lost else "")
@@ -173,10 +240,22 @@ class ConversingTeacher:
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
         """Give one experience for each episode; see :class:`rapid.teacher.memory.Reflective`."""
+        for experience, fault in self._converse([self._look_back(episode) for episode in episodes]):
+            self._watch(fault)
+            yield experience
+
+    def _converse(self, conversations: Sequence[Conversation[T]]) -> Iterator[T]:
+        """Lead conversations to their ends: all together if the chat can, else each in a thread."""
+        chat = self._chat
+        if isinstance(chat, BatchChat):
+            yield from converse(conversations, chat.ask_together)
+            return
+
+        def alone(conversation: Conversation[T]) -> T:
+            return converse([conversation], lambda requests: [_answer(chat, request) for request in requests])[0]
+
         with ThreadPoolExecutor(max(self._config.concurrency, 1)) as pool:
-            for experience, fault in pool.map(self._look_back, episodes):
-                self._watch(fault)
-                yield experience
+            yield from pool.map(alone, conversations)
 
     def _watch(self, fault: str) -> None:
         """Count what was lost to the server, and stop if it seems to be down."""
@@ -187,7 +266,7 @@ class ConversingTeacher:
                 "Is it running and reachable? What was collected is kept: run the same command again."
             )
 
-    def _look_back(self, episode: Episode) -> tuple[Experience, str]:
+    def _look_back(self, episode: Episode) -> Conversation[tuple[Experience, str]]:
         """Return the experience, and what kept the server from answering, if something did."""
         facts_T = [gather(scene) for scene in read_scenes(episode.obs_TVF, self._lanes)]
         step = moment(episode, facts_T)
@@ -198,10 +277,10 @@ class ConversingTeacher:
         talk = _Talk(_opening(reflection_prompt(facts_T, episode.decisions, step)))
         choice, lost = Choice(None), ""
         try:
-            choice = read_lesson(self._ask(talk, [], LESSON_SCHEMA).text, facts)
+            choice = read_lesson((yield from self._ask(talk, [], LESSON_SCHEMA)).text, facts)
             if choice.action is None:
                 talk.messages.append({"role": "user", "content": lesson_request(choice.fault, facts)})
-                choice = read_lesson(self._ask(talk, [], LESSON_SCHEMA).text, facts)
+                choice = read_lesson((yield from self._ask(talk, [], LESSON_SCHEMA)).text, facts)
         except ChatError as error:
             lost = f"no answer: {error}"
         if choice.action is not None:
@@ -215,17 +294,17 @@ class ConversingTeacher:
     def _cost(self, talk: _Talk) -> float:
         return (talk.tokens_in * self._config.price_in + talk.tokens_out * self._config.price_out) / 1e6
 
-    def _decide(self, facts: Facts, previous: Decision | None) -> Decision:
+    def _decide(self, facts: Facts, previous: Decision | None) -> Conversation[Decision]:
         start = time.perf_counter()
         examples = [show(experience) for experience in self.memory.recall(facts.scene, self._config.few_shot)]
         prompt = briefing(facts, previous, self._config.style, self._chat.native_tools, examples)
         talk = _Talk(_opening(prompt))
         choice = Choice(None)
         try:
-            choice = read_choice(self._reason(talk, facts), facts, self._config.style)
+            choice = read_choice((yield from self._reason(talk, facts)), facts, self._config.style)
             if choice.action is None:
                 talk.faults.append(choice.fault)
-                answer = self._correct(talk, facts, choice.fault)
+                answer = yield from self._correct(talk, facts, choice.fault)
                 choice = read_choice(answer, facts, self._config.style)
                 if choice.action is None:
                     talk.faults.append(choice.fault)
@@ -258,37 +337,39 @@ class ConversingTeacher:
             transcript=json.dumps(talk.messages[1:]),
         )
 
-    def _reason(self, talk: _Talk, facts: Facts) -> str:
+    def _reason(self, talk: _Talk, facts: Facts) -> Conversation[str]:
         """Let the model call tools until it answers without a call, or its turns are used up."""
         if self._config.style == "digest":
-            return self._conclude(talk)
+            return (yield from self._conclude(talk))
         tools = tool_specifications()
         for _ in range(self._config.max_turns):
-            reply = self._ask(talk, tools, None)
+            reply = yield from self._ask(talk, tools, None)
             spoken = read_call(reply.text) if not reply.calls else None
             if reply.calls:
                 for call in reply.calls:
                     result = call_tool(facts, call.name, call.arguments)
                     talk.messages.append({"role": "tool", "tool_call_id": call.id, "content": result})
             elif spoken:
-                talk.messages.append({"role": "user", "content": f"RESULT {call_tool(facts, *spoken)}"})
+                talk.messages.append({"role": "user", "content": tool_result(call_tool(facts, *spoken))})
             else:
                 return reply.text
-        return self._correct(talk, facts, "No more tool calls.")
+        return (yield from self._correct(talk, facts, "No more tool calls."))
 
-    def _correct(self, talk: _Talk, facts: Facts, fault: str) -> str:
+    def _correct(self, talk: _Talk, facts: Facts, fault: str) -> Conversation[str]:
         talk.messages.append({"role": "user", "content": repair_request(fault, facts, self._config.style)})
-        return self._conclude(talk)
+        return (yield from self._conclude(talk))
 
-    def _conclude(self, talk: _Talk) -> str:
+    def _conclude(self, talk: _Talk) -> Conversation[str]:
         """Let the model decide without any more tools: with one word, or by the schema."""
         one_word = self._config.style == "digest"
-        return self._ask(talk, [], None if one_word else DECISION_SCHEMA, one_word).text
+        return (yield from self._ask(talk, [], None if one_word else DECISION_SCHEMA, one_word)).text
 
     def _ask(
         self, talk: _Talk, tools: list[dict[str, Any]], schema: dict[str, Any] | None, logprobs: bool = False
-    ) -> Reply:
-        reply = self._chat.ask(talk.messages, tools, schema, logprobs)
+    ) -> Conversation[Reply]:
+        reply = yield Request(talk.messages, tools, schema, logprobs)
+        if isinstance(reply, ChatError):
+            raise reply
         talk.note(reply)
         message: Message = {"role": "assistant", "content": reply.text}
         if reply.calls:

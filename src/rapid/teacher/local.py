@@ -1,13 +1,15 @@
-"""A language model in this process, which scores words instead of writing: many prompts at once, on a CPU.
+"""A language model in this process, which scores words or writes: many prompts at once, on a CPU.
 
-Speed comes from three things. The key/value cache of the constant part of the prompt is computed once. Prompts of many
-worlds run through the model together. And the candidates are single tokens, so one pass over the short changing part
-gives the probability of every action.
+Speed of scoring comes from three things. The key/value cache of the constant part of the prompt is computed once.
+Prompts of many worlds run through the model together. And the candidates are single tokens, so one pass over the short
+changing part gives the probability of every action. To write is many times slower: each token takes a pass over all
+weights, which the conversations of many worlds share.
 """
 
 import gc
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,13 +18,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rapid.teacher.conversation import Message, Reply
+from rapid.teacher import int8
+from rapid.teacher.briefing import is_finished
+from rapid.teacher.conversation import Message, Reply, Request
 
 ROWS = 16
 """Prompts in one pass; more gain nothing and cost memory."""
 PAD = 16
-"""Prompts are padded to a multiple of this, and a lone prompt is doubled: then the same kernels run whatever the
-company, and a prompt's scores are the same bits in any batch (measured on AVX-512 with float32)."""
+"""What is read together is padded to a multiple of this, and what would be alone is doubled: then the same kernels run
+and sums have the same order whatever the company (measured on AVX-512: scores are the same bits in any batch)."""
+TALKS = 32
+"""Conversations that are answered side by side. Each token written costs one pass over all weights, which a CPU fetches
+as slowly for one conversation as for many."""
 REMEMBERED = 4096
 """Prompts whose scores are kept."""
 
@@ -38,15 +45,29 @@ class _Template(NamedTuple):
 _TEMPLATES = {"chatml": _Template("<|im_start|>{role}\n", "<|im_end|>\n", "<|im_end|>")}
 
 
+@dataclass
+class _Talk:
+    """A conversation and the answer that is being written."""
+
+    turns: tuple[str, ...]
+    read: list[int]
+    layers: list[tuple[Tensor, Tensor]]
+    """Keys and values of the first tokens of `read`, later of all of them and of `written` but the last."""
+    written: list[int] = field(default_factory=list[int])
+    text: str = ""
+
+
 class LocalModel:
     """A causal language model from a folder that transformers reads.
 
     Args:
         folder: ``config.json``, ``model.safetensors`` and ``tokenizer.json``.
         template: name of the chat template.
+        rounded: whether linear layers calculate in 8 bits, where the processor is fast at that
+            (:mod:`rapid.teacher.int8`): for a model that writes.
     """
 
-    def __init__(self, folder: Path, template: str = "chatml") -> None:
+    def __init__(self, folder: Path, template: str = "chatml", rounded: bool = False) -> None:
         from tokenizers import Tokenizer
         from transformers import AutoModelForCausalLM
         from transformers.utils import logging
@@ -55,9 +76,11 @@ class LocalModel:
         self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
         self._model: Any = AutoModelForCausalLM.from_pretrained(folder, dtype=torch.float32).eval()
         self._head: Tensor = self._model.get_output_embeddings().weight.detach()
+        if rounded and int8.is_fast():
+            int8.to_int8(self._model)
         self._template = _TEMPLATES[template]
         self._prefixes: dict[str, Any] = {}
-        self._talk: tuple[list[int], Any] | None = None
+        self._talks: dict[tuple[str, ...], _Talk] = {}
         self._scores: OrderedDict[tuple[str, str, tuple[str, ...]], tuple[NDArray[np.float64], int]] = OrderedDict()
         gc.collect()
 
@@ -140,7 +163,7 @@ class LocalModel:
         from transformers import DynamicCache
 
         rows = suffixes * 2 if len(suffixes) == 1 else suffixes
-        length = -(-max(map(len, rows)) // PAD) * PAD
+        length = _padded(max(map(len, rows)))
         ids_BT = torch.zeros(len(rows), length, dtype=torch.long)
         seen_BT = torch.ones(len(rows), prefix + length, dtype=torch.long)
         for row, ids in enumerate(rows):
@@ -155,49 +178,91 @@ class LocalModel:
         last_B = torch.tensor([len(ids) - 1 for ids in rows])
         return hidden_BTD[torch.arange(len(rows)), last_B][: len(suffixes)], hidden_BTD
 
-    @torch.no_grad()
-    def write(self, messages: Sequence[Message], limit: int) -> tuple[str, int, int]:
-        """Return the likeliest answer to a conversation, and the tokens read and written.
+    def write(
+        self,
+        conversations: Sequence[Sequence[Message]],
+        limit: int,
+        finished: Callable[[str], bool] = lambda text: False,
+    ) -> list[tuple[str, int, int]]:
+        """Return the likeliest answer to every conversation, and the tokens read and written.
 
-        The first two messages are the system's and the user's. What was computed of the constant part and of the
-        conversation's earlier turns is not computed again; nothing else is kept, so that an answer does not depend on
-        which conversations came before.
+        The first two messages of each are the system's and the user's. What was computed of the constant part is not
+        computed again, nor a conversation's earlier turns, if this call follows the one that answered its last turn.
+        Nothing else is kept, so that an answer does not depend on which conversations came before; nor on those beside
+        it, as far as was measured: SmolLM2 wrote the same texts alone and in batches of 5 and 8, rounded or not, thanks
+        to `PAD`, without which rounding to 8 bits blew up last bits to other words.
+
+        Args:
+            conversations: each a list of messages that ends with a user's.
+            limit: tokens that one answer may have.
+            finished: says of a text that nothing more is wanted; what a model would add is not written.
         """
-        turns = [self._begin(_role(message)) + message["content"] + self._template.end for message in messages]
-        head = turns[0] + self._begin("user")
-        read = self._encode(head) + self._encode("".join(turns)[len(head) :] + self._begin("assistant"))
-        cache = self._begun(messages, read)
-        ids = torch.tensor([read])
-        stop = self._tokenizer.token_to_id(self._template.stop)
-        out = self._model.generate(
-            ids,
-            attention_mask=torch.ones_like(ids),
-            past_key_values=cache,
-            do_sample=False,
-            max_new_tokens=limit,
-            eos_token_id=stop,
-            pad_token_id=stop,
-        )
-        self._talk = out[0].tolist(), cache
-        written = out[0, ids.shape[1] :].tolist()
-        return self._tokenizer.decode(written), ids.shape[1], len(written)
+        talks = [self._begin_talk(messages) for messages in conversations]
+        self._talks = {}
+        for first in range(0, len(talks), TALKS):
+            self._answer(talks[first : first + TALKS], limit, finished)
+        self._talks = {(*talk.turns, talk.text): talk for talk in talks}
+        return [(talk.text, len(talk.read), len(talk.written)) for talk in talks]
 
-    def _begun(self, messages: Sequence[Message], read: list[int]) -> Any:
-        """Return the key/value cache of how a conversation begins: its turns so far or, at first, the constant part."""
-        from transformers import DynamicCache
-
-        if len(messages) > 2 and self._talk is not None:
-            said, cache = self._talk
-            same = next((i for i, (a, b) in enumerate(zip(said, read, strict=False)) if a != b), len(said))
+    def _begin_talk(self, messages: Sequence[Message]) -> "_Talk":
+        """Return a conversation with the cache of how it begins: its turns so far or, at first, the constant part."""
+        turns = tuple(str(message["content"]) for message in messages)
+        said = [self._begin(_role(message)) + str(message["content"]) + self._template.end for message in messages]
+        head = said[0] + self._begin("user")
+        read = self._encode(head) + self._encode("".join(said)[len(head) :] + self._begin("assistant"))
+        if earlier := self._talks.get(turns[:-1]):
+            known, layers = earlier.read + earlier.written, earlier.layers
+            # What is read again may fall into other tokens than it was written in.
+            same = next((i for i, (a, b) in enumerate(zip(known, read, strict=False)) if a != b), len(known))
+            same = min(same, layers[0][0].shape[2])
+            layers = [(keys[:, :, :same], values[:, :, :same]) for keys, values in layers]
         else:
-            same, layers = self._prefix(messages[0]["content"])
-            cache = DynamicCache()
-            for layer, (keys, values) in enumerate(layers):
-                cache.update(keys, values, layer)
-        surplus = cache.get_seq_length() - min(same, len(read) - 1)
-        if surplus > 0:
-            cache.crop(-surplus)
-        return cache
+            layers = self._prefix(turns[0])[1]
+        return _Talk(turns, read, layers)
+
+    @torch.no_grad()
+    def _answer(self, talks: Sequence["_Talk"], limit: int, finished: Callable[[str], bool]) -> None:
+        """Write the answers of conversations, one token of each at a time; who is done leaves the batch."""
+        stop = self._tokenizer.token_to_id(self._template.stop)
+        talks = _not_alone(talks)
+        cache, seen_BT = _side_by_side([talk.layers for talk in talks])
+        unread = [talk.read[talk.layers[0][0].shape[2] :] for talk in talks]
+        while talks:
+            lengths_B = torch.tensor([len(ids) for ids in unread])
+            longest = max(map(len, unread))
+            steps_T = torch.arange(longest if longest == 1 else _padded(longest))
+            ids_BT = torch.tensor([ids + [0] * (len(steps_T) - len(ids)) for ids in unread])
+            positions_BT = seen_BT.sum(1, keepdim=True) + steps_T
+            seen_BT = torch.cat([seen_BT, steps_T < lengths_B[:, None]], 1)
+            hidden_BTD: Tensor = self._model.base_model(
+                input_ids=ids_BT,
+                attention_mask=seen_BT.long(),
+                position_ids=positions_BT,
+                past_key_values=cache,
+                use_cache=True,
+            ).last_hidden_state
+            chosen_B = (
+                self._model.get_output_embeddings()(hidden_BTD[range(len(talks)), lengths_B - 1]).argmax(-1).tolist()
+            )
+            for talk, token in zip(talks, chosen_B, strict=True):
+                talk.written.append(token)
+                talk.text = self._tokenizer.decode(talk.written)
+            on = [
+                row
+                for row, talk in enumerate(talks)
+                if talk.written[-1] != stop and len(talk.written) < limit and not finished(talk.text)
+            ]
+            if len(on) < len(talks):
+                for row in set(range(len(talks))) - set(on):
+                    seen_T = seen_BT[row]
+                    talks[row].layers = [
+                        (layer.keys[row : row + 1, :, seen_T], layer.values[row : row + 1, :, seen_T])
+                        for layer in cache.layers
+                    ]
+                talks, on = _not_alone([talks[row] for row in on]), on * 2 if len(on) == 1 else on
+                seen_BT = seen_BT[on]
+                cache.batch_select_indices(torch.tensor(on, dtype=torch.long))
+            unread = [talk.written[-1:] for talk in talks]
 
     @torch.no_grad()
     def _prefix(self, system: str) -> tuple[int, list[tuple[Tensor, Tensor]]]:
@@ -212,23 +277,43 @@ class LocalModel:
 
 
 class LocalChat:
-    """A local model that converses (:class:`rapid.teacher.conversation.Chat`), with the plain-text protocol."""
+    """A local model that converses, with the plain-text protocol (:class:`rapid.teacher.conversation.BatchChat`)."""
 
     native_tools = False
 
     def __init__(self, model: LocalModel, limit: int) -> None:
         self._model, self._limit = model, limit
 
-    def ask(
-        self,
-        messages: Sequence[Message],
-        tools: list[dict[str, Any]],
-        schema: dict[str, Any] | None,
-        logprobs: bool = False,
-    ) -> Reply:
-        """Answer a conversation; tools and schema are described in the messages already, probabilities not given."""
-        text, tokens_in, tokens_out = self._model.write(messages, self._limit)
-        return Reply(text, (), tokens_in, tokens_out)
+    def ask_together(self, requests: Sequence[Request]) -> list[Reply]:
+        """Answer conversations; tools and schema are described in the messages already, probabilities not given."""
+        answers = self._model.write([request.messages for request in requests], self._limit, is_finished)
+        return [Reply(text, (), tokens_in, tokens_out) for text, tokens_in, tokens_out in answers]
+
+
+def _padded(length: int) -> int:
+    return -(-length // PAD) * PAD
+
+
+def _not_alone(talks: Sequence[_Talk]) -> list[_Talk]:
+    """Return the conversations; a lone one with a twin: see `PAD`."""
+    return [*talks, replace(talks[0], written=[*talks[0].written])] if len(talks) == 1 else list(talks)
+
+
+def _side_by_side(rows: Sequence[list[tuple[Tensor, Tensor]]]) -> tuple[Any, Tensor]:
+    """Return the caches of several conversations as one, and which of its places are taken (B x T)."""
+    from transformers import DynamicCache
+
+    lengths = [layers[0][0].shape[2] for layers in rows]
+    longest = _padded(max(lengths))
+
+    def stacked(parts: Iterable[Tensor]) -> Tensor:
+        return torch.cat([torch.nn.functional.pad(part, (0, 0, 0, longest - part.shape[2])) for part in parts])
+
+    cache = DynamicCache()
+    for layer in range(len(rows[0])):
+        keys, values = (stacked(layers[layer][which] for layers in rows) for which in (0, 1))
+        cache.update(keys, values, layer)
+    return cache, torch.arange(longest) < torch.tensor(lengths)[:, None]
 
 
 def _role(message: dict[str, Any]) -> str:

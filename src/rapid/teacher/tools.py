@@ -112,6 +112,9 @@ def tool_specifications() -> list[dict[str, Any]]:
 
 
 def tool_help() -> str:
-    """Return the tools as text, for servers without native tool calling."""
-    lines = [f"{name}({', '.join(fields)}): {description}" for name, (_, description, fields) in _TOOLS.items()]
+    """Return the calls as text, for servers without native tool calling."""
+    lines: list[str] = []
+    for name, (_, description, fields) in _TOOLS.items():
+        arguments = f" {{{', '.join(f'{json.dumps(field)}: {field.upper()}' for field in fields)}}}" if fields else ""
+        lines.append(f"CALL {name}{arguments} - {description}")
     return "\n".join(lines)
