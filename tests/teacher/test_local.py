@@ -179,6 +179,7 @@ def test_a_local_model_converses(gguf, world, tmp_path, monkeypatch):
     decision = make_teacher(config, 3).decide(world(), [None])[0]
     assert decision.status == "fallback"
     assert decision.tokens_out > 0
+    assert make_teacher(config, 3).describe()["arithmetic"] in ("int8", "float32")
 
 
 def test_a_conversation_goes_on_from_what_was_computed(model, monkeypatch):

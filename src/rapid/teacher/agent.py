@@ -142,6 +142,7 @@ def make_model_teacher(config: TeacherConfig, lanes: int, seed: int) -> Teacher:
     model = LocalModel(folder, template, rounded=writes)
     identity = {**identity, "weights_sha256": digest_sha256}
     if writes:
+        identity["arithmetic"] = "int8" if model.rounded else "float32"
         return ConversingTeacher(LocalChat(model, config.max_answer_tokens), config, identity, lanes, memory)
     return ScoringTeacher(
         model, identity, lanes, stream_seed(seed, "teacher/shuffle") if config.shuffle_facts else None

@@ -76,7 +76,9 @@ class LocalModel:
         self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
         self._model: Any = AutoModelForCausalLM.from_pretrained(folder, dtype=torch.float32).eval()
         self._head: Tensor = self._model.get_output_embeddings().weight.detach()
-        if rounded and int8.is_fast():
+        self.rounded = rounded and int8.is_fast()
+        """Whether it is so."""
+        if self.rounded:
             int8.to_int8(self._model)
         self._template = _TEMPLATES[template]
         self._prefixes: dict[str, Any] = {}
