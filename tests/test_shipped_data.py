@@ -7,15 +7,17 @@ from pathlib import Path
 import pytest
 
 from rapid import pipeline
-from rapid.config import Config, apply_overrides, preset
+from rapid.config import Config, TeacherConfig, apply_overrides, preset
 from rapid.data.card import card
 from rapid.data.dataset import load_dataset
 from rapid.data.shipped import dataset_folder, shipped_sets
 from rapid.data.transitions import RANDOM, TEACHER
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
+from rapid.evaluation.teachers import drive_teacher
 from rapid.files import read_json
 from rapid.scenarios import PAPER_SCENARIOS
+from rapid.teacher import make_teacher
 from rapid.verbs import call
 
 SMALL = {
@@ -38,14 +40,25 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
 def test_every_shipped_set_is_whole_and_names_no_place(name: str):
     data = load_dataset(f"shipped:{name}")
     scenario, kind = name.split("/")
-    assert (data.scenario, len(data) >= 15_000) == (scenario, True)
+    assert (data.scenario, len(data) >= (100 if kind == "react" else 15_000)) == (scenario, True)
     assert set(data.transitions.source_N.tolist()) == {RANDOM if kind == "random" else TEACHER}
     assert data.log is not None
     assert data.log.num_rows == len(data)
-    if kind == "teacher":
+    if kind in ("teacher", "react"):
         assert all(data.log.column("transcript").to_pylist())
     facts = (dataset_folder(f"shipped:{name}") / "dataset.json").read_text()
     assert not re.search(r"/(home|root|tmp|work|Users)\b|api_key|base_url", facts)
+
+
+def test_the_shipped_conversations_are_repeated_without_a_model():
+    """Every prompt of theirs is still the one that the model was given."""
+    path = dataset_folder(f"shipped:{PAPER_SCENARIOS[0]}/react")
+    steps = load_dataset(path).transitions
+    teacher = make_teacher(TeacherConfig(backend="replay", replay_file=str(path)), 3)
+    seeds = list(dict.fromkeys(steps.spawn_seed_N.tolist()))
+    rows = drive_teacher(teacher, "replay", PAPER_SCENARIOS[0], seeds, len(seeds))
+    assert sum(row.length for row in rows) == len(steps)
+    assert sum(row.episode_return for row in rows) == pytest.approx(float(steps.reward_N.sum()), abs=1e-3)
 
 
 def test_all_of_them_together_are_small():
