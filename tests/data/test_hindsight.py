@@ -22,7 +22,8 @@ from rapid.data.dataset import Dataset, join, load_dataset
 from rapid.data.driving import Budget
 from rapid.data.sharding import collect_shards
 from rapid.errors import RapidError
-from rapid.teacher.conversation import ConversingTeacher, Reply
+from rapid.teacher.chat import Reply
+from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.experience import SITUATION_SIZE, Experience, read_experiences, to_lines
 from rapid.teacher.memory import Episode, Memory
 from rapid.teacher.replay import Replay

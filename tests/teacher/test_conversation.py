@@ -9,7 +9,8 @@ import pytest
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher.conversation import ChatError, ConversingTeacher, Reply, Request, ToolCall
+from rapid.teacher.chat import ChatError, Reply, Request, ToolCall
+from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.decision import Decision, to_record
 from rapid.teacher.facts import gather, safest
 from rapid.teacher.replay import Replay

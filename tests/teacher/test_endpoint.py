@@ -11,7 +11,8 @@ from fake_server import Server, answer, completion, drop, hang, refuse
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.teacher import from_record, make_teacher, to_record
-from rapid.teacher.conversation import ChatError, ConversingTeacher
+from rapid.teacher.chat import ChatError
+from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.endpoint import Endpoint
 
 SECRET = "sk-planted-0123456789"

@@ -9,7 +9,8 @@ import pytest
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.teacher import check_teacher
-from rapid.teacher.conversation import FAILURES_IN_A_ROW, ChatError, ConversingTeacher, Reply
+from rapid.teacher.chat import ChatError, Reply
+from rapid.teacher.conversation import FAILURES_IN_A_ROW, ConversingTeacher
 from rapid.teacher.decision import Decision, to_record
 from rapid.teacher.experience import SITUATION_SIZE, Experience, read_experiences, to_lines
 from rapid.teacher.facts import gather

@@ -3,17 +3,15 @@
 In `digest` style one word is asked for, so that the probabilities of the tokens at that place, where a server gives
 them, are a soft label. In `react` style the decision follows from what was said before it and is certain by then.
 
-Each conversation is a generator that yields what it asks. Those with a server run in threads; those with a model in
-this process run in lockstep, so that the model answers all that wait at once.
+Each conversation is a generator that yields what it asks (:func:`rapid.teacher.chat.converse`).
 """
 
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +29,7 @@ from rapid.teacher.briefing import (
     repair_request,
     tool_result,
 )
+from rapid.teacher.chat import BatchChat, Chat, ChatError, Conversation, Message, Reply, Request, converse
 from rapid.teacher.decision import Decision
 from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts, gather, safest
@@ -48,112 +47,10 @@ from rapid.teacher.reflection import (
 from rapid.teacher.scene import read_scenes
 from rapid.teacher.tools import call_tool, tool_specifications
 
-Message = dict[str, Any]
+T = TypeVar("T")
 
 FAILURES_IN_A_ROW = 5
 """Conversations lost to the server, one after the other, after which it is taken to be down."""
-
-
-class ChatError(Exception):
-    """The server gave no answer, after all retries; `retries` says how many."""
-
-    def __init__(self, message: str, retries: int = 0) -> None:
-        super().__init__(message)
-        self.retries = retries
-
-
-@dataclass(frozen=True)
-class ToolCall:
-    """A call as the server reports it."""
-
-    id: str
-    name: str
-    arguments: str
-
-
-@dataclass(frozen=True)
-class Reply:
-    """One answer of a model."""
-
-    text: str
-    calls: tuple[ToolCall, ...] = ()
-    tokens_in: int = 0
-    tokens_out: int = 0
-    retries: int = 0
-    tokens: tuple[Token, ...] = ()
-    """The tokens of `text` with their probabilities, where they were asked for and given."""
-
-
-@dataclass(frozen=True)
-class Request:
-    """What a model is asked: to answer a conversation."""
-
-    messages: Sequence[Message]
-    tools: list[dict[str, Any]]
-    schema: dict[str, Any] | None
-    """The form that the answer should have."""
-    logprobs: bool = False
-    """Whether the probabilities of the answer's tokens are wanted."""
-
-
-class Chat(Protocol):
-    """A model that answers one conversation at a time, and several at once from threads."""
-
-    @property
-    def native_tools(self) -> bool:
-        """Whether tools are passed beside the messages; if not, the plain-text protocol is used."""
-        ...
-
-    def ask(
-        self,
-        messages: Sequence[Message],
-        tools: list[dict[str, Any]],
-        schema: dict[str, Any] | None,
-        logprobs: bool = False,
-    ) -> Reply:
-        """Answer; `schema` and `logprobs` are wishes: the caller checks the form, and does without probabilities.
-
-        Raises:
-            ChatError: no answer could be had this time.
-            RapidError: none will ever be had: a wrong key, address or model.
-        """
-        ...
-
-
-@runtime_checkable
-class BatchChat(Protocol):
-    """A model that answers many conversations together."""
-
-    @property
-    def native_tools(self) -> bool:
-        """See :class:`Chat`."""
-        ...
-
-    def ask_together(self, requests: Sequence[Request]) -> list[Reply]:
-        """Answer every request; see :meth:`Chat.ask`."""
-        ...
-
-
-T = TypeVar("T")
-Conversation = Generator[Request, Reply | ChatError, T]
-"""Yields what it asks, is sent the answer or what went wrong, and returns what came of it."""
-
-
-def converse(
-    conversations: Sequence[Conversation[T]], answer: Callable[[Sequence[Request]], Sequence[Reply | ChatError]]
-) -> list[T]:
-    """Lead conversations in lockstep to their ends: all that wait for an answer are answered together."""
-    results: dict[int, T] = {}
-    answers: dict[int, Any] = dict.fromkeys(range(len(conversations)))
-    while answers:
-        waiting: dict[int, Request] = {}
-        for number, said in answers.items():
-            try:
-                waiting[number] = conversations[number].send(said)
-            except StopIteration as end:
-                results[number] = end.value
-        answers = dict(zip(waiting, answer(list(waiting.values())), strict=True)) if waiting else {}
-    return [results[number] for number in range(len(conversations))]
 
 
 @dataclass
@@ -177,13 +74,6 @@ class _Talk:
 
 def _opening(prompt: Prompt) -> list[Message]:
     return [{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}]
-
-
-def _answer(chat: Chat, request: Request) -> Reply | ChatError:
-    try:
-        return chat.ask(request.messages, request.tools, request.schema, request.logprobs)
-    except ChatError as error:
-        return error
 
 
 class ConversingTeacher:
@@ -229,7 +119,7 @@ class ConversingTeacher:
         """
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
         start = time.perf_counter()
-        decisions = list(self._converse([self._decide(*given) for given in zip(all_facts, previous, strict=True)]))
+        decisions = list(self._lead([self._decide(*given) for given in zip(all_facts, previous, strict=True)]))
         if isinstance(self._chat, BatchChat):
             seconds = (time.perf_counter() - start) / max(len(decisions), 1)
             decisions = [dataclasses.replace(decision, seconds=seconds) for decision in decisions]
@@ -240,22 +130,12 @@ class ConversingTeacher:
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
         """Give one experience for each episode; see :class:`rapid.teacher.memory.Reflective`."""
-        for experience, fault in self._converse([self._look_back(episode) for episode in episodes]):
+        for experience, fault in self._lead([self._look_back(episode) for episode in episodes]):
             self._watch(fault)
             yield experience
 
-    def _converse(self, conversations: Sequence[Conversation[T]]) -> Iterator[T]:
-        """Lead conversations to their ends: all together if the chat can, else each in a thread."""
-        chat = self._chat
-        if isinstance(chat, BatchChat):
-            yield from converse(conversations, chat.ask_together)
-            return
-
-        def alone(conversation: Conversation[T]) -> T:
-            return converse([conversation], lambda requests: [_answer(chat, request) for request in requests])[0]
-
-        with ThreadPoolExecutor(max(self._config.concurrency, 1)) as pool:
-            yield from pool.map(alone, conversations)
+    def _lead(self, conversations: Sequence[Conversation[T]]) -> Iterator[T]:
+        return converse(conversations, self._chat, self._config.concurrency)
 
     def _watch(self, fault: str) -> None:
         """Count what was lost to the server, and stop if it seems to be down."""

@@ -20,7 +20,7 @@ import openai
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher.conversation import ChatError, Message, Reply, ToolCall
+from rapid.teacher.chat import ChatError, Message, Reply, ToolCall
 from rapid.teacher.logprobs import TOP, Token
 
 LONGEST_WAIT = 60.0
@@ -32,7 +32,7 @@ ERROR_LIMIT = 300
 
 
 class Endpoint:
-    """A chat model behind an address; implements :class:`rapid.teacher.conversation.Chat`. Safe to use from threads.
+    """A chat model behind an address; implements :class:`rapid.teacher.chat.Chat`. Safe to use from threads.
 
     Args:
         config: address, model, key variable, time limit, retries and rate.
@@ -79,7 +79,7 @@ class Endpoint:
         schema: dict[str, Any] | None,
         logprobs: bool = False,
     ) -> Reply:
-        """Answer a conversation, with bounded retries; see :class:`rapid.teacher.conversation.Chat`."""
+        """Answer a conversation, with bounded retries; see :class:`rapid.teacher.chat.Chat`."""
         retries = 0
         while True:
             options = self._options(tools, schema, logprobs)

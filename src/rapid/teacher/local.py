@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rapid.teacher import int8
 from rapid.teacher.briefing import is_finished
-from rapid.teacher.conversation import Message, Reply, Request
+from rapid.teacher.chat import Message, Reply, Request
 
 ROWS = 16
 """Prompts in one pass; more gain nothing and cost memory."""
@@ -279,7 +279,7 @@ class LocalModel:
 
 
 class LocalChat:
-    """A local model that converses, with the plain-text protocol (:class:`rapid.teacher.conversation.BatchChat`)."""
+    """A local model that converses, with the plain-text protocol (:class:`rapid.teacher.chat.BatchChat`)."""
 
     native_tools = False
 
