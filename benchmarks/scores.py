@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from rapid import pipeline
-from rapid.config import Config, TeacherConfig, preset
+from rapid.config import AdaptConfig, Config, TeacherConfig, preset
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder
@@ -38,6 +38,8 @@ from rapid.teacher import make_teacher
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
+LONG = 50_000
+"""Online steps from which on it pays to forget for a while what was distilled (:func:`boldly`)."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
@@ -100,6 +102,8 @@ def train(
         agents.append((name, home / "agent"))
     for steps in budgets:
         adapt = replace(config.adapt, scenario=scenario, steps=steps)
+        if config.recipe == "strong" and steps >= LONG:
+            adapt = boldly(adapt)
         from_scratch = replace(
             adapt,
             train="scratch",
@@ -107,7 +111,7 @@ def train(
             exploration_end=0.05,
             offline_share=0.0,
             loss=replace(adapt.loss, conservative_weight=0.0),
-            optimizer=replace(adapt.optimizer, learning_rate=5e-4),
+            optimizer=replace(adapt.optimizer, learning_rate=5e-4, batch_size=config.adapt.optimizer.batch_size),
         )
         online = {
             f"RAPID, {short(steps)}": (adapt, work / "distilled", mixture),
@@ -124,6 +128,20 @@ def train(
                 pipeline.adapt_agent(replace(config, adapt=settings), origin / "agent", offline, home, name)
             agents.append((name, home / "agent"))
     return agents
+
+
+def boldly(adapt: AdaptConfig) -> AdaptConfig:
+    """Return the settings for many steps: nothing holds the policy to the data, and it explores more."""
+    return replace(
+        adapt,
+        num_envs=20,
+        updates_per_step=0.3,
+        exploration_start=0.2,
+        exploration_end=0.05,
+        offline_share=0.0,
+        loss=replace(adapt.loss, conservative_weight=0.0, td_error="huber"),
+        optimizer=replace(adapt.optimizer, learning_rate=1.5e-4, batch_size=32),
+    )
 
 
 def datasets(scenario: str, work: Path) -> tuple[Path, Path]:
@@ -208,7 +226,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         "",
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
-        f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
+        f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each, "
+        f"from {short(LONG)} steps on {boldly(config.adapt).updates_per_step:g}. "
         "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
