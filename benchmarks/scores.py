@@ -16,11 +16,12 @@ import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rapid import pipeline
-from rapid.config import AdaptConfig, Config, TeacherConfig, preset
+from rapid.config import AdaptConfig, Config, TeacherConfig, preset, to_dict
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder
@@ -39,7 +40,7 @@ from rapid.teacher import make_teacher
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
 LONG = 50_000
-"""Online steps from which on it pays to forget for a while what was distilled (:func:`boldly`)."""
+"""Online steps from which on RAPID is not held to the data any more (:func:`boldly`)."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
@@ -131,7 +132,7 @@ def train(
 
 
 def boldly(adapt: AdaptConfig) -> AdaptConfig:
-    """Return the settings for many steps: nothing holds the policy to the data, and it explores more."""
+    """Return the settings for many steps: nothing holds the policy to the data, it explores more and learns slower."""
     return replace(
         adapt,
         num_envs=20,
@@ -142,6 +143,20 @@ def boldly(adapt: AdaptConfig) -> AdaptConfig:
         loss=replace(adapt.loss, conservative_weight=0.0, td_error="huber"),
         optimizer=replace(adapt.optimizer, learning_rate=1.5e-4, batch_size=32),
     )
+
+
+def differing(adapt: AdaptConfig) -> str:
+    """Return what :func:`boldly` sets otherwise, as settings with their values."""
+    before, after = flatten(to_dict(adapt)), flatten(to_dict(boldly(adapt)))
+    return ", ".join(f"`{name}` {value}" for name, value in after.items() if value != before[name])
+
+
+def flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
+    """Return nested settings by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        found |= flatten(value, f"{path}{name}.") if isinstance(value, dict) else {f"{path}{name}": value}
+    return found
 
 
 def datasets(scenario: str, work: Path) -> tuple[Path, Path]:
@@ -226,9 +241,9 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         "",
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
-        f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each, "
-        f"from {short(LONG)} steps on {boldly(config.adapt).updates_per_step:g}. "
-        "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
+        f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
+        + (f"From {short(LONG)} steps on: {differing(config.adapt)}. " if config.recipe == "strong" else "")
+        + "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
     ]

@@ -1,9 +1,9 @@
 """What a gradient step of RAPID costs, beside a network built from torch's own layers, all in turns in one process.
 
-The naive network is what one writes first: a projection, two layers of `torch.nn.TransformerEncoderLayer` for each
-policy and two for the decoder, width 64, feed-forward 256. Every variant takes a few steps, then the next one does,
-round after round, so that a busy moment meets them all; CPU time is counted, on one thread. Writes `update-speed.md`
-and `update-speed.json`.
+The naive network is what one writes first: two layers of `torch.nn.TransformerEncoderLayer` for each policy and two for
+the decoder, width 64, four heads, feed-forward 256; `same size` is the same with RAPID's sizes. Every variant takes a few
+steps, then the next one does, round after round, so that a busy moment meets them all; CPU time is counted, on one
+thread. Writes `update-speed.md` and `update-speed.json`.
 
     python benchmarks/update_speed.py --rounds 11
 """
@@ -48,7 +48,7 @@ class Variant:
 
     title: str
     network: str
-    """`rapid`, or `naive` for torch's own layers."""
+    """`rapid`; torch's own layers, `naive` in the usual sizes or `same size` in RAPID's."""
     batch_size: int
     phase: str = "distill"
     steps: int = 0
@@ -59,10 +59,10 @@ class Variant:
 class NaiveEncoder(nn.Module):
     """A transformer from torch's own layers over tokens (B, T, D); the interface of `rapid.networks.blocks`."""
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: NetworkConfig, layers: int) -> None:
         super().__init__()
         layer = nn.TransformerEncoderLayer(config.width, config.heads, config.feedforward, 0.0, batch_first=True)
-        self.encoder = nn.TransformerEncoder(layer, config.layers, enable_nested_tensor=False)
+        self.encoder = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
 
     def forward(self, tokens_BTD: Tensor, mask_B11T: Tensor | None, first_only: bool = False) -> Tensor:
         """Return the encoded tokens (B, T, D) or, with `first_only`, the first one (B, D)."""
@@ -75,13 +75,15 @@ def network_of(kind: str, config: Config, lanes: int) -> QNetwork:
     """Return RAPID's network, or one with every transformer replaced by torch's own layers."""
     if kind == "rapid":
         return build_network(config.network, lanes, 0)
-    wide = replace(config.network, width=64, heads=4, layers=2, decoder_layers=2, feedforward=256)
-    network = build_network(wide, lanes, 0)
+    sizes = config.network
+    if kind == "naive":
+        sizes = replace(sizes, width=64, heads=4, layers=2, decoder_layers=2, feedforward=256)
+    network = build_network(sizes, lanes, 0)
     head = network.head
     assert isinstance(head, TokenHead)
     for policy in head.mixture.policies:
-        policy.transformer = NaiveEncoder(wide)
-    head.decoder.transformer = NaiveEncoder(wide)  # pyright: ignore[reportAttributeAccessIssue]
+        policy.transformer = NaiveEncoder(sizes, sizes.layers)
+    head.decoder.transformer = NaiveEncoder(sizes, sizes.decoder_layers)  # pyright: ignore[reportAttributeAccessIssue]
     return network
 
 
@@ -122,10 +124,12 @@ def variants() -> list[Variant]:
     for size in (32, 64):
         found += [
             Variant("naive, no PGD", "naive", size),
+            Variant("same size, no PGD", "same size", size),
             Variant("distil, no PGD", "rapid", size),
             Variant("distil, PGD-5 on the teacher's quarter", "rapid", size, steps=5),
             Variant("distil, PGD-10 on the teacher's quarter", "rapid", size, steps=10),
             Variant("naive, PGD-10 on all", "naive", size, steps=10, attacked="all"),
+            Variant("same size, PGD-10 on all", "same size", size, steps=10, attacked="all"),
             Variant("distil, PGD-10 on all", "rapid", size, steps=10, attacked="all"),
             Variant("adapt, gate open", "rapid", size, "adapt"),
         ]
@@ -161,35 +165,37 @@ def report(results: list[dict[str, Any]], config: Config, rounds: int, command: 
         "# What a gradient step costs",
         "",
         f"Milliseconds of CPU time on one thread, median (least to most) of {rounds} rounds of {BATCHES} updates, all "
-        f"variants in turns. RAPID: recipe `{config.recipe}`, width {network.width}, {network.heads} head, "
-        f"{network.layers} layer a policy, {network.decoder_layers} in the decoder. Naive: torch's own layers, width "
-        "64, feed-forward 256, two layers each. The ratio is to the naive network's update of the same kind, round "
-        "by round.",
+        f"variants in turns. RAPID: recipe `{config.recipe}`, width {network.width}, {network.heads} head, feed-forward "
+        f"{network.feedforward}, {network.layers} layer a policy, {network.decoder_layers} in the decoder. Naive: "
+        "torch's own layers, width 64, 4 heads, feed-forward 256, two layers each; same size: torch's own layers in "
+        "RAPID's sizes. The ratios are to the update of the same kind in the same round.",
         "",
-        "| update | batch | ms | naive / this |",
-        "|---|---|---|---|",
+        "| update | batch | ms | naive / this | same size / this |",
+        "|---|---|---|---|---|",
     ]
     for result in results:
-        naive = next(
-            (
-                other
-                for other in results
-                if other["network"] == "naive"
-                and other["batch_size"] == result["batch_size"]
-                and other["variant"].split(", ", 1)[1] == result["variant"].split(", ", 1)[1]
-            ),
-            None,
+        cells = [ratio(results, result, network) for network in ("naive", "same size")]
+        lines.append(
+            f"| {result['variant']} | {result['batch_size']} | {shown(result['ms'], 1)} | {' | '.join(cells)} |"
         )
-        ratio = "–"
-        if naive and naive is not result:
-            ratio = f"×{shown([a / b for a, b in zip(naive['ms'], result['ms'], strict=True)], 1)}"
-        lines.append(f"| {result['variant']} | {result['batch_size']} | {shown(result['ms'], 1)} | {ratio} |")
     lines += [
         "",
         f"{processor()}, torch {version('torch')}, Python {platform.python_version()}, commit {commit() or 'unknown'}. "
         f"Made with `{command}`.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def ratio(results: list[dict[str, Any]], result: dict[str, Any], network: str) -> str:
+    """Return how many times as long the same update of another network takes."""
+
+    def kind(of: dict[str, Any]) -> tuple[int, str]:
+        return of["batch_size"], of["variant"].split(", ", 1)[1]
+
+    others = [of for of in results if of["network"] == network and kind(of) == kind(result)]
+    if not others or others[0] is result:
+        return "–"
+    return f"×{shown([a / b for a, b in zip(others[0]['ms'], result['ms'], strict=True)], 1)}"
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from rapid.config import (
     TeacherConfig,
 )
 from rapid.errors import RapidError
-from rapid.scenarios import PAPER_SCENARIOS, Reward
+from rapid.scenarios import PAPER_SCENARIOS, Reward, get_scenario
 from rapid.tracking import Tracking
 
 T = TypeVar("T")
@@ -89,7 +89,7 @@ class Relabel:
     """Give a collected dataset the scenario's other reward: its episodes are driven again, action by action."""
 
     dataset: Annotated[Positional[str], arg(metavar="DATASET")]
-    """Directory of the dataset, whole as it was collected."""
+    """Directory of the dataset as it was collected, or a shipped set such as shipped:lane-3-density-2/teacher."""
     reward: Reward = "progress"
     """The reward that is wanted; `progress` counts distance and not crashing alone."""
     out: str = "data/relabelled"
@@ -364,6 +364,10 @@ def _relabel(options: Relabel, config: Config) -> int:
 
     out = _new_folder(options.out)
     dataset = load_dataset(options.dataset)
+    if get_scenario(dataset.scenario).reward == options.reward:
+        raise RapidError(
+            f"'{options.dataset}' has the reward '{options.reward}' already. Name the other with --reward."
+        )
     with task("relabel", len(dataset), "transitions") as progress:
         save_dataset(relabel(dataset, options.reward, progress), out)
     print(f"{len(dataset)} transitions in {options.out}")

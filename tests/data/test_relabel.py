@@ -64,6 +64,28 @@ def test_what_cannot_be_driven_again_is_refused():
         relabel(replace(dataset, transitions=changed), "progress")
 
 
+def test_the_verb_writes_a_dataset_with_all_that_was_said(tmp_path):
+    source = f"shipped:{SCENARIO}/react"
+    with pytest.raises(SystemExit) as exit_:
+        main(["relabel", source, "--out", str(tmp_path / "progress")])
+    assert exit_.value.code == 0
+    before, after = load_dataset(source), load_dataset(tmp_path / "progress")
+    assert after.scenario == PROGRESS
+    assert after.drivers == before.drivers
+    assert after.log.equals(before.log)
+    assert (after.transitions.reward_N != before.transitions.reward_N).any()
+    # A collection would go on under the new reward, and under no other.
+    assert after.collection["settings"]["scenario"] == PROGRESS
+
+
+def test_the_verb_refuses_the_reward_that_is_there(tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["relabel", f"shipped:{SCENARIO}/react", "--reward", "normalized", "--out", str(tmp_path / "out")])
+    assert exit_.value.code == 2
+    assert "already" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_verb_keeps_what_is_there(tmp_path, capsys):
     (tmp_path / "kept.txt").write_text("mine")
     with pytest.raises(SystemExit) as exit_:

@@ -1,6 +1,7 @@
 """The same driving under another reward: recorded episodes are driven again in the simulator, action by action."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ def relabel(dataset: Dataset, reward: Reward, progress: Task | None = None) -> D
     again, and what is seen on the way is compared with the record.
 
     Args:
-        dataset: whole episodes, as they were collected.
+        dataset: episodes without gaps, as they were collected.
         reward: which one is wanted.
         progress: counts transitions.
 
@@ -34,19 +35,22 @@ def relabel(dataset: Dataset, reward: Reward, progress: Task | None = None) -> D
     before = get_scenario(dataset.scenario)
     after = replace(before, reward=reward)
     rows = dataset.transitions
-    episodes = _whole_episodes(rows)
+    episodes = _episodes(rows)
     reward_N = np.empty_like(rows.reward_N)
     for first in range(0, len(episodes), WORLDS):
         chosen = episodes[first : first + WORLDS]
         _drive(rows, chosen, after.name, reward_N)
         if progress:
             progress.advance(sum(map(len, chosen)))
-    collection = {**(dataset.collection or {}), "relabelled_from": before.name}
+    collection: dict[str, Any] = {**(dataset.collection or {}), "relabelled_from": before.name}
+    if settings := collection.get("settings"):
+        # A collection that goes on from here goes on under this reward.
+        collection["settings"] = {**settings, "scenario": after.name}
     return replace(dataset, scenario=after.name, transitions=replace(rows, reward_N=reward_N), collection=collection)
 
 
-def _whole_episodes(rows: Transitions) -> list[NDArray[np.int64]]:
-    """Return the rows of every episode, in the order of its steps."""
+def _episodes(rows: Transitions) -> list[NDArray[np.int64]]:
+    """Return the rows of every episode, from its first step on without a gap."""
     starts = np.flatnonzero(rows.step_N == 0)
     ends = np.append(starts[1:], len(rows))
     follows_N = rows.follows_N()
