@@ -1,8 +1,8 @@
 """What a gradient step of RAPID costs, beside a network built from torch's own layers, all in turns in one process.
 
 The naive network is what one writes first: two layers of `torch.nn.TransformerEncoderLayer` for each policy and two for
-the decoder, width 64, four heads, feed-forward 256; `same size` is the same with RAPID's sizes. Every variant takes some
-steps, then the next one does, round after round, so that a busy moment meets them all; CPU time is counted, on one
+the decoder, width 64, four heads, feed-forward 256; `same size` is the same with RAPID's sizes. Each variant takes
+some steps, then the next one does, round after round, so that a busy moment meets them all; CPU time is counted, on one
 thread. Writes `update-speed.md` and `update-speed.json`.
 
     python benchmarks/update_speed.py --rounds 11
@@ -166,9 +166,9 @@ def report(results: list[dict[str, Any]], config: Config, rounds: int, command: 
         "",
         f"Milliseconds of CPU time on one thread, median (least to most) of {rounds} rounds of {BATCHES} updates, all "
         f"variants in turns. RAPID: recipe `{config.recipe}`, width {network.width}, {network.heads} head, feed-"
-        f"forward {network.feedforward}, {network.layers} layer a policy, {network.decoder_layers} in the decoder. Naive: "
-        "torch's own layers, width 64, 4 heads, feed-forward 256, two layers each; same size: torch's own layers in "
-        "RAPID's sizes. The ratios are to the update of the same kind in the same round.",
+        f"forward {network.feedforward}, {network.layers} layer a policy, {network.decoder_layers} in the decoder. "
+        "Naive: torch's own layers, width 64, 4 heads, feed-forward 256, two layers each; same size: torch's own "
+        "layers in RAPID's sizes. The ratios are to the update of the same kind in the same round.",
         "",
         "| update | batch | ms | naive / this | same size / this |",
         "|---|---|---|---|---|",
