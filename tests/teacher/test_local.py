@@ -8,7 +8,7 @@ import torch
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher import local, make_teacher, models
+from rapid.teacher import int8, local, make_teacher, models
 from rapid.teacher.agent import ScoringTeacher, softmax_over
 from rapid.teacher.gguf import convert
 from rapid.teacher.int8 import Int8Linear
@@ -269,6 +269,11 @@ def test_rounded_layers_are_near_and_do_not_depend_on_the_batch():
         alone_BTN = torch.stack([torch.stack([rounded(row_K) for row_K in row_TK]) for row_TK in inputs_BTK])
     assert torch.equal(outputs_BTN, alone_BTN)
     assert torch.equal(rounded(torch.zeros(64)), layer.bias)
+
+
+def test_a_processor_that_torch_cannot_tell_about_is_not_fast(monkeypatch):
+    monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
+    assert not int8.is_fast()
 
 
 def test_a_model_that_writes_may_be_rounded(gguf, tmp_path, monkeypatch):

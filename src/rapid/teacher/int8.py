@@ -4,6 +4,8 @@ Weights have one scale for each output, activations one for each token, so that 
 the other tokens in the batch, and sums of whole numbers are exact in any order.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -12,7 +14,9 @@ LARGEST = 127
 
 def is_fast() -> bool:
     """Say whether the processor multiplies and adds bytes in one instruction (AVX-512 VNNI)."""
-    return bool(torch.cpu.get_capabilities().get("avx512_vnni"))
+    # Older versions of torch cannot tell.
+    capabilities: Callable[[], dict[str, bool]] = getattr(torch.cpu, "get_capabilities", dict)
+    return bool(capabilities().get("avx512_vnni"))
 
 
 class Int8Linear(nn.Module):
@@ -39,7 +43,7 @@ class Int8Linear(nn.Module):
 
 
 def to_int8(model: nn.Module) -> None:
-    """Replace the linear layers of a model by ones in whole numbers; the former weights are given up."""
+    """Replace the linear layers of a model by ones in whole numbers; only weights that others hold stay in memory."""
     for parent in list(model.modules()):
         for name, child in list(parent.named_children()):
             if isinstance(child, nn.Linear):

@@ -75,6 +75,7 @@ class LocalModel:
         logging.disable_progress_bar()
         self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
         self._model: Any = AutoModelForCausalLM.from_pretrained(folder, dtype=torch.float32).eval()
+        # Words are scored with the head in float32, so it stays in memory even where layers are rounded.
         self._head: Tensor = self._model.get_output_embeddings().weight.detach()
         self.rounded = rounded and int8.is_fast()
         """Whether it is so."""
