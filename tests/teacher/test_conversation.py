@@ -131,6 +131,18 @@ def test_endless_tool_calls_end(world):
     assert len(script.heard) == 3 + 1 + 1
 
 
+@pytest.mark.parametrize("form", ["{}", "- {}", "**{}**", "I call {}", "CALL {}"])
+def test_a_call_on_the_forced_turn_is_no_decision(world, form):
+    call = Reply(form.format('forecast_action {"action": "faster"}'))
+    script = Script(call, call, Reply(KEEP), native_tools=False)
+    decision = decide(script, world, "react", max_turns=1)
+    assert (decision.action, decision.status) == (1, "repaired")
+    last = [messages[-1]["content"] for messages in script.heard[1:]]
+    assert last[0].startswith("No more tool calls.")
+    assert last[1].startswith("That was a call, not a decision.")
+    assert decide(Script(call, native_tools=False), world, "react", max_turns=1).status == "fallback"
+
+
 def test_a_dead_server_falls_back_then_stops(world):
     driver = teacher(Script(ChatError("APIConnectionError: gone", 4)))
     obs_BVF = world()

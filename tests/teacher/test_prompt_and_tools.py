@@ -106,6 +106,36 @@ def test_calls_in_plain_text():
     assert read_call("CALL available_actions()") == ("available_actions", "{}")
 
 
+ARGUMENTS = '{"action": "faster"}'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"forecast_action {ARGUMENTS}",
+        f"- forecast_action {ARGUMENTS}",
+        f"**forecast_action {ARGUMENTS}**",
+        f"`forecast_action` {ARGUMENTS}",
+        f"forecast_action: {ARGUMENTS}",
+        f"CALL forecast_action: {ARGUMENTS}",
+        f"I call forecast_action {ARGUMENTS}.",
+        f"First forecast_action:\n```json\n{ARGUMENTS}\n```",
+        f'{{"tool": "forecast_action", {ARGUMENTS}',
+        f'{{"forecast_action": {ARGUMENTS}}}',
+    ],
+)
+def test_an_object_after_the_name_of_a_tool_is_no_decision(facts, text):
+    assert read_call(text) == ("forecast_action", ARGUMENTS)
+    assert read_choice(text, facts, "react").fault == "That was a call, not a decision."
+    assert is_finished(text)
+
+
+def test_a_decision_may_name_a_tool(facts):
+    text = 'As forecast_action said: {"explanation": "forecast_action says safe", "action": "faster"}'
+    assert read_call(text) is None
+    assert read_choice(text, facts, "react").action == FASTER
+
+
 @pytest.mark.parametrize(
     ("text", "done"),
     [

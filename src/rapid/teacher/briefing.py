@@ -32,9 +32,20 @@ _FORMATS = {
     "digest": "Answer with one word, the action, and nothing else.",
     "react": 'Give your decision as JSON and nothing else: {"explanation": "at most ten words", "action": "ACTION"}',
 }
-# Small models leave the word CALL out, or put brackets around the arguments. A call must not be taken for a decision.
+_NAMES = "|".join(TOOL_NAMES)
+_GAP = r"[^\w{]*(?:json\s*)?"
+# Small models leave the word CALL out, or put other words, brackets or punctuation around it. A call must not be taken
+# for a decision: an object that follows a tool's name holds arguments.
 _CALL = re.compile(
-    rf"^[ \t]*(?:CALL[ \t]+|(?=(?:{'|'.join(TOOL_NAMES)})[ \t]*(?:[({{]|$)))(\w+)[ \t]*\(?(.*?)\)?[ \t]*$", re.MULTILINE
+    rf"""
+    (?: ^[ \t]*CALL[ \t]+                         # CALL and any name,
+      | \b(?=(?:{_NAMES}){_GAP}\{{)               # or a tool's name before an object,
+      | ^[ \t]*(?=(?:{_NAMES})[ \t]*(?:\(|$)) )   # or before a bracket, or alone in a line;
+    (\w+)
+    (?: {_GAP}(\{{[^{{}}]*\}})                    # then an object,
+      | [ \t]*\(?(.*?)\)?[ \t]*$ )                # or whatever follows in the line
+    """,
+    re.MULTILINE | re.VERBOSE,
 )
 
 
@@ -101,14 +112,14 @@ def briefing(
 def read_call(text: str) -> tuple[str, str] | None:
     """Return the tool and the arguments that a text asks for, or `None`."""
     match = _CALL.search(text)
-    return (match[1], match[2] or "{}") if match else None
+    return (match[1], match[2] or match[3] or "{}") if match else None
 
 
 def is_finished(text: str) -> bool:
     """Say whether a text that is still being written holds a whole call or decision: the rest would be made up."""
     call = _CALL.search(text)
     if call:
-        return call[2].endswith("}") or "\n" in text[call.end() :]
+        return bool(call[2]) or call[3].endswith("}") or "\n" in text[call.end() :]
     return "action" in (_last_object(text) or {})
 
 
@@ -119,6 +130,8 @@ def read_choice(text: str, facts: Facts, style: str, reason: str = "explanation"
     """
     if not text.strip():
         return Choice(None, fault="The answer was empty.")
+    if style == "react" and read_call(text):
+        return Choice(None, fault="That was a call, not a decision.")
     # Some think aloud first; a last line that is an action says what they mean.
     word = text.strip().splitlines()[-1].strip(" .\"'`*")
     answer = {"action": word} if style == "digest" and action_named(word) is not None else _last_object(text)
