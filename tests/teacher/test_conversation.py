@@ -9,7 +9,7 @@ import pytest
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher.chat import ChatError, Reply, Request, ToolCall
+from rapid.teacher.chat import ChatError, Conversation, Reply, Request, ToolCall, converse
 from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.decision import Decision, to_record
 from rapid.teacher.facts import gather, safest
@@ -97,11 +97,14 @@ class Choir:
     native_tools = False
 
     def __init__(self):
-        self.asked = []
+        self.asked, self.ended = [], 0
 
     def ask_together(self, requests: Sequence[Request]) -> list[Reply]:
         self.asked.append(len(requests))
         return [self.reply(request.messages) for request in requests]
+
+    def end(self) -> None:
+        self.ended += 1
 
     def ask(self, messages: Sequence[dict], tools: list[dict], schema: dict | None, logprobs: bool = False) -> Reply:
         return self.reply(messages)
@@ -117,11 +120,24 @@ def test_worlds_are_led_in_lockstep_as_each_would_be_alone(crowd):
     choir = Choir()
     together = teacher(choir, "react").decide(crowd, [None] * len(crowd))
     assert choir.asked[:2] == [24, 24]
+    assert choir.ended == 1
     assert choir.asked == sorted(choir.asked, reverse=True)
     assert len({decision.explanation for decision in together}) == len(choir.asked) - 1 == 3
     assert len({decision.seconds for decision in together}) == 1
     alone = [teacher(Choir(), "react").decide(crowd[i : i + 1], [None])[0] for i in range(len(crowd))]
     assert [replace(d, seconds=0) for d in together] == [replace(d, seconds=0) for d in alone]
+
+
+def test_what_came_of_a_conversation_does_not_wait_for_those_after_it():
+    def conversation(turns: int) -> Conversation[int]:
+        for _ in range(turns):
+            yield Request([{"content": "in lane 3"}] * 2, [], None)
+        return turns
+
+    choir, turns = Choir(), [1, 2, 1, 3, 0]
+    seen = [(result, len(choir.asked), choir.ended) for result in converse([*map(conversation, turns)], choir, 1)]
+    assert seen == [(1, 1, 0), (2, 2, 0), (1, 2, 0), (3, 3, 0), (0, 3, 0)]
+    assert (choir.asked, choir.ended) == ([4, 2, 1], 1)
 
 
 def test_endless_tool_calls_end(world):

@@ -176,7 +176,9 @@ def test_a_path_serves_as_a_model(gguf, crowd, tmp_path, monkeypatch):
 def test_a_local_model_converses(gguf, world, tmp_path, monkeypatch):
     monkeypatch.setenv("RAPID_CACHE", str(tmp_path))
     config = TeacherConfig(model=str(gguf[0]), style="react", max_answer_tokens=4, max_turns=1)
-    decision = make_teacher(config, 3).decide(world(), [None])[0]
+    teacher = make_teacher(config, 3)
+    decision = teacher.decide(world(), [None])[0]
+    assert not teacher._chat._model._talks, "nothing is kept of conversations that are over"
     assert decision.status == "fallback"
     assert decision.tokens_out > 0
     assert make_teacher(config, 3).describe()["arithmetic"] in ("int8", "float32")
@@ -198,6 +200,20 @@ def test_a_conversation_goes_on_from_what_was_computed(model, monkeypatch):
         fresh = passes[0]["input_ids"].shape[1]
         assert fresh < tokens_in - (30 if turn else 10)
         messages += [{"role": "assistant", "content": text}, {"role": "user", "content": f"RESULT {turn}"}]
+
+
+def test_only_what_is_new_is_computed_after_two_messages(model, monkeypatch):
+    """As on the turn when a model must decide: the request for it comes after the last tool's result."""
+    passes, forward = [], model._model.base_model.forward
+    messages = talks((5,))[0]
+    [(text, *before)] = model.write([messages], 6)
+    messages = [*answered(messages, text), {"role": "user", "content": "Decide."}]
+    monkeypatch.setattr(model._model.base_model, "forward", lambda **given: passes.append(given) or forward(**given))
+    [found] = model.write([messages], 6)
+    # The last token of the answer was written but not read.
+    assert passes[0]["input_ids"].shape[1] == local._padded(found[1] - sum(before) + 1) < found[1]
+    model.end()
+    assert model.write([messages], 6) == [found]
 
 
 def test_an_answer_does_not_depend_on_the_conversation_before(model):

@@ -89,6 +89,10 @@ class BatchChat(Protocol):
         """Answer every request; see :meth:`Chat.ask`."""
         ...
 
+    def end(self) -> None:
+        """Forget the conversations: all are over."""
+        ...
+
 
 T = TypeVar("T")
 Conversation = Generator[Request, Reply | ChatError, T]
@@ -96,13 +100,20 @@ Conversation = Generator[Request, Reply | ChatError, T]
 
 
 def converse(conversations: Sequence[Conversation[T]], chat: Chat | BatchChat, concurrency: int) -> Iterator[T]:
-    """Lead conversations to their ends: all together if the chat can, else `concurrency` at once, each in a thread."""
+    """Lead conversations to their ends: all together if the chat can, else `concurrency` at once, each in a thread.
+
+    What came of them is given in their order, each as soon as it and those before it have ended.
+    """
     if isinstance(chat, BatchChat):
-        yield from _in_lockstep(conversations, chat.ask_together)
+        try:
+            yield from _in_lockstep(conversations, chat.ask_together)
+        finally:
+            chat.end()
         return
 
     def alone(conversation: Conversation[T]) -> T:
-        return _in_lockstep([conversation], lambda requests: [_answer(chat, request) for request in requests])[0]
+        [result] = _in_lockstep([conversation], lambda requests: [_answer(chat, request) for request in requests])
+        return result
 
     with ThreadPoolExecutor(max(concurrency, 1)) as pool:
         yield from pool.map(alone, conversations)
@@ -110,9 +121,10 @@ def converse(conversations: Sequence[Conversation[T]], chat: Chat | BatchChat, c
 
 def _in_lockstep(
     conversations: Sequence[Conversation[T]], answer: Callable[[Sequence[Request]], Sequence[Reply | ChatError]]
-) -> list[T]:
+) -> Iterator[T]:
     """Lead conversations to their ends; all that wait for an answer are answered together."""
     results: dict[int, T] = {}
+    given = 0
     answers: dict[int, Any] = dict.fromkeys(range(len(conversations)))
     while answers:
         waiting: dict[int, Request] = {}
@@ -121,8 +133,10 @@ def _in_lockstep(
                 waiting[number] = conversations[number].send(said)
             except StopIteration as end:
                 results[number] = end.value
+        while given in results:
+            yield results.pop(given)
+            given += 1
         answers = dict(zip(waiting, answer(list(waiting.values())), strict=True)) if waiting else {}
-    return [results[number] for number in range(len(conversations))]
 
 
 def _answer(chat: Chat, request: Request) -> Reply | ChatError:

@@ -190,10 +190,10 @@ class LocalModel:
         """Return the likeliest answer to every conversation, and the tokens read and written.
 
         The first two messages of each are the system's and the user's. What was computed of the constant part is not
-        computed again, nor a conversation's earlier turns, if this call follows the one that answered its last turn.
-        Nothing else is kept, so that an answer does not depend on which conversations came before; nor on those beside
-        it, as far as was measured: SmolLM2 wrote the same texts alone and in batches of 5 and 8, rounded or not, thanks
-        to `PAD`, without which rounding to 8 bits blew up last bits to other words.
+        computed again, nor a conversation's earlier turns, if the call before this one answered the last of them and
+        :meth:`end` was not called since. Nothing else is kept, so that an answer does not depend on which conversations
+        came before; nor on those beside it, as far as was measured: SmolLM2 wrote the same texts alone and in batches
+        of 5 and 8, rounded or not, thanks to `PAD`, without which rounding to 8 bits blew up last bits to other words.
 
         Args:
             conversations: each a list of messages that ends with a user's.
@@ -207,13 +207,19 @@ class LocalModel:
         self._talks = {(*talk.turns, talk.text): talk for talk in talks}
         return [(talk.text, len(talk.read), len(talk.written)) for talk in talks]
 
+    def end(self) -> None:
+        """Drop what was computed of conversations, which are over."""
+        self._talks = {}
+
     def _begin_talk(self, messages: Sequence[Message]) -> "_Talk":
         """Return a conversation with the cache of how it begins: its turns so far or, at first, the constant part."""
         turns = tuple(str(message["content"]) for message in messages)
         said = [self._begin(_role(message)) + str(message["content"]) + self._template.end for message in messages]
         head = said[0] + self._begin("user")
         read = self._encode(head) + self._encode("".join(said)[len(head) :] + self._begin("assistant"))
-        if earlier := self._talks.get(turns[:-1]):
+        # More than one message may follow the last answer.
+        known_turns = (turns[:end] for end in range(len(turns) - 1, 0, -1))
+        if earlier := next((self._talks[known] for known in known_turns if known in self._talks), None):
             known, layers = earlier.read + earlier.written, earlier.layers
             # What is read again may fall into other tokens than it was written in.
             same = next((i for i, (a, b) in enumerate(zip(known, read, strict=False)) if a != b), len(known))
@@ -291,6 +297,10 @@ class LocalChat:
         """Answer conversations; tools and schema are described in the messages already, probabilities not given."""
         answers = self._model.write([request.messages for request in requests], self._limit, is_finished)
         return [Reply(text, (), tokens_in, tokens_out) for text, tokens_in, tokens_out in answers]
+
+    def end(self) -> None:
+        """Free the memory that the conversations took."""
+        self._model.end()
 
 
 def _padded(length: int) -> int:
