@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rapid.config import TeacherConfig
 from rapid.data.collection import collect
 from rapid.data.dataset import DATASET_FILE, Dataset, load_dataset
-from rapid.data.driving import Budget, Tally
+from rapid.data.driving import Tally
 from rapid.evaluation.summary import NOT_RUN, number
 from rapid.evaluation.teacher_summary import summarize_teachers, teachers_markdown
 from rapid.evaluation.teachers import TeacherRow, drive_teacher, load_teacher_rows, save_teacher_rows
@@ -31,6 +31,7 @@ from rapid.files import write_text
 from rapid.progress import task
 from rapid.runs import commit
 from rapid.scenarios import get_scenario
+from rapid.spawns import train_part
 from rapid.teacher import make_teacher
 from rapid.teacher.decision import Decision, from_record
 from simulator import processor
@@ -66,29 +67,33 @@ class Recorded:
 def collected(config: TeacherConfig, chosen: argparse.Namespace) -> Dataset:
     """Return the episodes of the model that converses, driving those that are missing."""
     home: Path = chosen.work / f"{chosen.scenario}-{config.model}-react"
+    seeds = train_part("teacher")[: chosen.episodes]
     if (home / DATASET_FILE).exists():
         data = load_dataset(home)
-        if len(np.unique(data.transitions.episode_N)) >= chosen.episodes:
+        if spawns(data) == list(seeds):
             return data
     duration = int(get_scenario(chosen.scenario).config()["duration"])
-    longest = chosen.episodes * duration
-    with task("react", longest, "decisions") as progress:
+    with task("react", len(seeds) * duration, "decisions") as progress:
 
         def watch(tally: Tally) -> None:
             progress.note(f"{tally.rate:.3g} decisions/s, {tally.fallbacks} fallbacks")
 
-        # So many decisions suffice for so many episodes, however long they are; there may be more, if some are short.
         teacher = make_teacher(config, get_scenario(chosen.scenario).lanes)
         return collect(
             teacher,
             chosen.scenario,
             home,
-            longest - duration + 1,
+            None,
             chosen.lockstep,
-            budget=Budget(decisions=longest),
+            seeds=seeds,
             progress=progress,
             watch=watch,
         )
+
+
+def spawns(data: Dataset) -> list[int]:
+    """Return the spawn seed of each episode."""
+    return list(dict.fromkeys(data.transitions.spawn_seed_N.tolist()))
 
 
 def spoken(data: Dataset) -> tuple[float, float]:
@@ -114,16 +119,18 @@ def driven(name: str, config: TeacherConfig, seeds: list[int], chosen: argparse.
     return load_teacher_rows(path)
 
 
-def report(rows: list[TeacherRow], talk: tuple[float, float], chosen: argparse.Namespace) -> str:
-    """Return the tables as Markdown."""
+def report(rows: list[TeacherRow], data: Dataset, chosen: argparse.Namespace) -> str:
+    """Return the tables as Markdown; `data` holds the conversations."""
+    talk = spoken(data)
+    arithmetic = data.drivers["teacher"].get("arithmetic", "8 bits where the processor is fast at that")
     names = list(dict.fromkeys(row.teacher for row in rows))
     lines = [
         "# `react` against `digest`",
         "",
         f"{chosen.scenario}, {sum(row.teacher == names[0] for row in rows)} spawns of the set `train`, episodes in "
-        f"lockstep. {processor()}, {os.cpu_count()} cores, one thread{', *busy*' if chosen.busy else ''}. Weights and "
-        "activations of the model that converses are rounded to 8 bits where the processor is fast at that; the models "
-        "that score calculate in float32 and remember the scores of prompts that they have seen.",
+        f"lockstep. {processor()}, {os.cpu_count()} cores, one thread{', *busy*' if chosen.busy else ''}. The model "
+        f"that converses calculated in {arithmetic}; those that score calculate in float32 and remember the scores of "
+        "prompts that they have seen.",
         "",
         f"Made with: {' '.join(['python', 'benchmarks/react_against_digest.py', *sys.argv[1:]])}, commit "
         f"{commit() or 'unknown'}.",
@@ -162,7 +169,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--scenario", default="lane-3-density-2")
     parser.add_argument("--model", default="qwen2.5-coder-1.5b")
-    parser.add_argument("--episodes", type=int, default=20, help="at least so many, of each driver")
+    parser.add_argument("--episodes", type=int, default=20, help="spawns, the same for each driver")
     parser.add_argument("--lockstep", type=int, default=20, help="episodes side by side")
     parser.add_argument("--answer-tokens", type=int, default=60, help="tokens that one answer may have")
     parser.add_argument("--turns", type=int, default=3, help="tool calls before the model must decide")
@@ -176,8 +183,7 @@ def main() -> None:
         model=chosen.model, style="react", max_answer_tokens=chosen.answer_tokens, max_turns=chosen.turns
     )
     data = collected(config, chosen)
-    steps = data.transitions
-    seeds = [int(seed) for seed in dict.fromkeys(steps.spawn_seed_N.tolist())]
+    seeds = spawns(data)
     others = {
         f"{chosen.model}:digest": TeacherConfig(model=chosen.model),
         f"{SMALL}:digest": TeacherConfig(model=SMALL),
@@ -192,7 +198,7 @@ def main() -> None:
     first = [row for row in rows if row.teacher == f"{chosen.model}:digest"]
     rows = [*first, *react, *rows[len(first) :]]
     save_teacher_rows(chosen.out / "react.parquet", rows)
-    text = report(rows, spoken(data), chosen)
+    text = report(rows, data, chosen)
     write_text(chosen.out / "react.md", text)
     print(text)
 

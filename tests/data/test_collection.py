@@ -43,6 +43,18 @@ def whole(tmp_path_factory) -> tuple[dict[str, bytes], int]:
     return content(directory), teacher.asked
 
 
+def test_one_episode_of_each_seed(tmp_path):
+    seeds = [7, 3, 11, 5, 2, 13]
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, FakeTeacher(fail_after=40), None, seeds=seeds)
+    rows = run(tmp_path, None, None, seeds=seeds).transitions
+    assert rows.spawn_seed_N[rows.step_N == 0].tolist() == seeds
+    assert rows.done_N.sum() == len(seeds)
+    nobody = FakeTeacher()
+    assert_equal(run(tmp_path, nobody, None, seeds=seeds).transitions, rows)
+    assert nobody.asked == 0
+
+
 def test_episodes_are_whole_and_lead_from_state_to_state(tmp_path):
     dataset = run(tmp_path)
     rows = dataset.transitions

@@ -14,6 +14,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rapid.data.dataset import DATASET_FILE, Dataset, load_dataset, save_dataset
 from rapid.data.driving import Budget, Collecting, MakeWorlds, SpentError, Tally
 from rapid.data.journal import check_settings, exclusive
@@ -48,7 +50,7 @@ def collect(
     teacher: Teacher,
     scenario: str,
     directory: str | os.PathLike[str],
-    transitions: int,
+    transitions: int | None,
     lockstep: int = 16,
     *,
     source: TrainPart = "teacher",
@@ -66,6 +68,7 @@ def collect(
         scenario: name of the scenario.
         directory: the dataset's place.
         transitions: how many; of all shards together. At most 29 more are collected, to end with a whole episode.
+            None is one episode of each of the `seeds`.
         lockstep: episodes driven side by side.
         source: `teacher` or `random`: the provenance of every transition.
         seeds: spawn seeds, used in order; None is the part of the set `train` that belongs to the source.
@@ -97,9 +100,10 @@ def collect(
         raise RapidError(f"Cannot collect in '{root}': {error}. Choose a directory that you can write to.") from error
     with exclusive(work / "lock"):
         dataset = _resume(root, work, settings)
-        target = math.ceil(transitions / parts)
+        target = None if transitions is None else math.ceil(transitions / parts)
         if dataset is not None:
-            if len(dataset) >= target:
+            episodes = len(np.unique(dataset.transitions.episode_N))
+            if episodes >= len(seeds) if target is None else len(dataset) >= target:
                 shutil.rmtree(work)
                 if progress:
                     progress.skip(len(dataset))

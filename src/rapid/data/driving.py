@@ -100,18 +100,20 @@ class Collecting:
         if progress:
             progress.skip(self.count)
 
-    def collect_until(self, target: int, lockstep: int, seeds: Sequence[int], make_worlds: MakeWorlds) -> str:
-        """Drive groups until there are `target` transitions; return which budget was spent, or nothing."""
+    def collect_until(self, target: int | None, lockstep: int, seeds: Sequence[int], make_worlds: MakeWorlds) -> str:
+        """Drive groups until there are `target` transitions, or from all seeds; return the budget spent, or nothing."""
         duration = int(get_scenario(self.settings["scenario"]).config()["duration"])
         worlds: Any = None
         try:
             self._look_back()
-            while self.count < target:
+            while self.episodes < len(seeds) if target is None else self.count < target:
                 journal = Journal(self.work / "journal.jsonl", len(self.parts))
                 try:
                     # The last groups are smaller, so that little more than the target is collected, and no group is
                     # begun that the decisions left would not finish.
-                    wanted = min(lockstep, math.ceil((target - self.count) / duration))
+                    wanted = lockstep
+                    if target is not None:
+                        wanted = min(wanted, math.ceil((target - self.count) / duration))
                     if self.budget.decisions and journal.seeds is None:
                         wanted = min(wanted, (self.budget.decisions - self.decisions) // duration)
                         if wanted < 1:
