@@ -39,7 +39,9 @@ class TeacherConfig:
     """Name of the model (`rapid models list`), of the server's model, or of the scripted driver
     (random, idle, slower, faster, rule, rule-forecast, rule-foresight, uniform-safe)."""
     style: Literal["digest", "react"] = "digest"
-    """`digest` inlines every tool result and asks for one decision; `react` lets the model call the tools in turns."""
+    """`digest` inlines every tool result and asks for one decision; `react` lets the model call the tools in turns. A
+    `local` model that converses calculates in 8 bits where the processor is fast at that (AVX-512 VNNI), so its answers
+    may differ between processors."""
     base_url: str = "http://127.0.0.1:8000/v1"
     """Address of the OpenAI-compatible server (`endpoint`)."""
     api_key_env: str = "OPENAI_API_KEY"
@@ -85,7 +87,8 @@ class CollectConfig:
     random_transitions: int = 15_000
     """Transitions of the uniformly random driver."""
     lockstep: int = 16
-    """Episodes driven side by side, so that the model sees a batch of prompts."""
+    """Episodes driven side by side, so that the model sees a batch of prompts; a `local` model that converses answers
+    all of them together."""
     max_tokens: int = 0
     """Stop collecting when the teacher has read and written so many tokens; 0 is no limit."""
     max_cost: float = 0.0
