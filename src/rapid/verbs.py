@@ -188,7 +188,7 @@ class TeachBench:
     spawn_set: Literal["tune", "test"] = "tune"
     """Where the spawn seeds come from: `tune` to choose a teacher, `test` to report one that was chosen elsewhere."""
     lockstep: int = 64
-    """Episodes driven side by side, so that a model sees a batch of prompts."""
+    """Episodes driven side by side: a `local` model answers all of them together."""
     out: str = "teach-bench"
     """Directory of the rows, the table and the plot."""
     simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
