@@ -22,7 +22,7 @@ from rapid.data.dataset import Dataset, join, load_dataset
 from rapid.data.driving import Budget
 from rapid.data.sharding import collect_shards
 from rapid.errors import RapidError
-from rapid.teacher.chat import Reply
+from rapid.teacher.chat import Reply, Request
 from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.experience import SITUATION_SIZE, Experience, read_experiences, to_lines
 from rapid.teacher.memory import Episode, Memory
@@ -217,8 +217,8 @@ class Chatter:
 
     native_tools = False
 
-    def ask(self, messages, tools, schema, logprobs=False) -> Reply:
-        after_a_crash = messages[0]["content"].startswith("You teach")
+    def ask(self, request: Request) -> Reply:
+        after_a_crash = request.messages[0]["content"].startswith("You teach")
         return Reply('{"lesson": "leave room", "action": "slower"}' if after_a_crash else "keep", (), 9, 1)
 
 

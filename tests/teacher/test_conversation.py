@@ -26,8 +26,8 @@ class Script:
         self.lines, self.native_tools = list(lines), native_tools
         self.heard: list[list[dict]] = []
 
-    def ask(self, messages: Sequence[dict], tools: list[dict], schema: dict | None, logprobs: bool = False) -> Reply:
-        self.heard.append(list(messages))
+    def ask(self, request: Request) -> Reply:
+        self.heard.append(list(request.messages))
         line = self.lines.pop(0) if len(self.lines) > 1 else self.lines[0]
         if isinstance(line, Exception):
             raise line
@@ -106,8 +106,8 @@ class Choir:
     def end(self) -> None:
         self.ended += 1
 
-    def ask(self, messages: Sequence[dict], tools: list[dict], schema: dict | None, logprobs: bool = False) -> Reply:
-        return self.reply(messages)
+    def ask(self, request: Request) -> Reply:
+        return self.reply(request.messages)
 
     def reply(self, messages):
         lane = int(messages[1]["content"].split("in lane ")[1][0])

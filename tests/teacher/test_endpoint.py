@@ -11,7 +11,7 @@ from fake_server import Server, answer, completion, drop, hang, refuse
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.teacher import from_record, make_teacher, to_record
-from rapid.teacher.chat import ChatError
+from rapid.teacher.chat import ChatError, Request
 from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.endpoint import Endpoint
 
@@ -203,7 +203,7 @@ def test_the_key_is_found_nowhere(server, world, monkeypatch):
     made = make_teacher(config, 3)
     said = [json.dumps(to_record(decision)), json.dumps(driver.describe()), repr(chat), repr(config), repr(made)]
     with pytest.raises(ChatError) as caught:
-        chat.ask([{"role": "user", "content": "?"}], [], None)
+        chat.ask(Request([{"role": "user", "content": "?"}], [], None))
     assert not [text for text in [*said, repr(caught.value)] if SECRET in text]
 
 

@@ -9,7 +9,7 @@ import pytest
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.teacher import check_teacher
-from rapid.teacher.chat import ChatError, Reply
+from rapid.teacher.chat import ChatError, Reply, Request
 from rapid.teacher.conversation import FAILURES_IN_A_ROW, ConversingTeacher
 from rapid.teacher.decision import Decision, to_record
 from rapid.teacher.experience import SITUATION_SIZE, Experience, read_experiences, to_lines
@@ -33,9 +33,9 @@ class Script:
         self.lesson, self.decision = lesson, decision
         self.heard: list[list[dict]] = []
 
-    def ask(self, messages, tools, schema, logprobs=False) -> Reply:
-        self.heard.append(list(messages))
-        said = self.lesson if messages[0]["content"].startswith("You teach") else self.decision
+    def ask(self, request: Request) -> Reply:
+        self.heard.append(list(request.messages))
+        said = self.lesson if request.messages[0]["content"].startswith("You teach") else self.decision
         if isinstance(said, Exception):
             raise said
         return Reply(said, (), 100, 10)

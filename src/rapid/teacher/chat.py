@@ -60,13 +60,7 @@ class Chat(Protocol):
         """Whether tools are passed beside the messages; if not, the plain-text protocol is used."""
         ...
 
-    def ask(
-        self,
-        messages: Sequence[Message],
-        tools: list[dict[str, Any]],
-        schema: dict[str, Any] | None,
-        logprobs: bool = False,
-    ) -> Reply:
+    def ask(self, request: Request) -> Reply:
         """Answer; `schema` and `logprobs` are wishes: the caller checks the form, and does without probabilities.
 
         Raises:
@@ -141,6 +135,6 @@ def _in_lockstep(
 
 def _answer(chat: Chat, request: Request) -> Reply | ChatError:
     try:
-        return chat.ask(request.messages, request.tools, request.schema, request.logprobs)
+        return chat.ask(request)
     except ChatError as error:
         return error

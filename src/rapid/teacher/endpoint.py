@@ -20,7 +20,7 @@ import openai
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher.chat import ChatError, Message, Reply, ToolCall
+from rapid.teacher.chat import ChatError, Message, Reply, Request, ToolCall
 from rapid.teacher.logprobs import TOP, Token
 
 LONGEST_WAIT = 60.0
@@ -72,20 +72,14 @@ class Endpoint:
         """Whether tools are passed beside the messages."""
         return self._tools
 
-    def ask(
-        self,
-        messages: Sequence[Message],
-        tools: list[dict[str, Any]],
-        schema: dict[str, Any] | None,
-        logprobs: bool = False,
-    ) -> Reply:
+    def ask(self, request: Request) -> Reply:
         """Answer a conversation, with bounded retries; see :class:`rapid.teacher.chat.Chat`."""
         retries = 0
         while True:
-            options = self._options(tools, schema, logprobs)
+            options = self._options(request)
             self._wait_for_slot()
             try:
-                return self._read(self._request(messages, options), retries)
+                return self._read(self._request(request.messages, options), retries)
             except (openai.AuthenticationError, openai.PermissionDeniedError) as error:
                 raise RapidError(
                     f"{self._config.base_url} refuses the key: {self._clean(error)}. Put a valid key into the "
@@ -105,14 +99,14 @@ class Endpoint:
                 time.sleep(self._pause(error, retries))
                 retries += 1
 
-    def _options(self, tools: list[dict[str, Any]], schema: dict[str, Any] | None, logprobs: bool) -> dict[str, Any]:
+    def _options(self, request: Request) -> dict[str, Any]:
         options: dict[str, Any] = {}
-        if logprobs and self._logprobs:
+        if request.logprobs and self._logprobs:
             options |= {"logprobs": True, "top_logprobs": TOP}
-        if tools and self._tools:
-            options["tools"] = tools
-        if schema and self._schema:
-            described = {"name": "decision", "schema": schema, "strict": True}
+        if request.tools and self._tools:
+            options["tools"] = request.tools
+        if request.schema and self._schema:
+            described = {"name": "decision", "schema": request.schema, "strict": True}
             options["response_format"] = {"type": "json_schema", "json_schema": described}
         return options
 
