@@ -111,7 +111,7 @@ def train(
             exploration_start=1.0,
             exploration_end=0.05,
             offline_share=0.0,
-            loss=replace(adapt.loss, conservative_weight=0.0),
+            loss=replace(adapt.loss, conservative_weight=0.0, double=True),
             optimizer=replace(adapt.optimizer, learning_rate=5e-4, batch_size=config.adapt.optimizer.batch_size),
         )
         online = {
