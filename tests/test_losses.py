@@ -14,6 +14,7 @@ from rapid.losses import (
     behavior_cloning_loss,
     conservative_loss,
     cross_entropy,
+    munchausen_target,
     q_loss,
     td_loss,
     td_target,
@@ -73,6 +74,46 @@ def test_targets_by_hand():
     )
     assert td_target(online, target, batch, double=False).tolist() == pytest.approx([7.3, 0.5 + 0.729 * 4, -1])
     assert td_target(online, target, batch, double=True).tolist() == pytest.approx([2.8, 0.5 + 0.729 * 3, -1])
+
+
+def test_munchausen_targets_by_hand():
+    # Q/T = ln 8 and ln 2 beside three zeros: probabilities 8/13 and 2/13. In the second state one action is all.
+    temperature = 0.5
+    network = by_table([[math.log(8) / 2, math.log(2) / 2, 0.0, 0, 0], [50.0, 0, 0, 0, 0]])
+    batch = TransitionBatch(
+        scene(0, 1, 0),
+        torch.tensor([1, 0, 0]),
+        torch.tensor([1.0, 0.5, -1.0]),
+        scene(1, 0, 0),
+        torch.tensor([0.9, 0.9**3, 0.0]),
+        torch.zeros(3, dtype=torch.bool),
+        None,
+    )
+    soft_value = math.log(13) / 2
+    expected = [
+        1 + 0.9 * 0.5 * math.log(2 / 13) + 0.9 * 50,
+        0.5 + 0.729 * soft_value,
+        -1 + 0.9 * 0.5 * math.log(8 / 13),
+    ]
+    assert munchausen_target(network, batch, 0.9, temperature).tolist() == pytest.approx(expected)
+    # logsumexp is the expectation of Q - T log pi under pi.
+    q = torch.tensor([math.log(8) / 2, math.log(2) / 2, 0, 0, 0])
+    log_pi = (q / temperature).log_softmax(0)
+    assert (log_pi.exp() * (q - temperature * log_pi)).sum().item() == pytest.approx(soft_value)
+    # An action that the target would never take costs no more than the floor.
+    unlikely = batch._replace(obs_BVF=scene(1, 1, 1), action_B=torch.tensor([3, 3, 3]))
+    assert munchausen_target(network, unlikely, 0.9, temperature)[2].item() == pytest.approx(-1 - 0.9)
+
+
+def test_munchausen_reaches_the_loss_and_near_zero_temperature_is_dqn(batch):
+    network, target = networks()
+    generator = torch.Generator()
+    plain = LossConfig(double=False, conservative_weight=0.0, robust_weight=0.0)
+    dqn = q_loss(network, target, batch, plain, generator)
+    cold = replace(plain, munchausen_weight=1e-6, munchausen_temperature=1e-5)
+    assert q_loss(network, target, batch, cold, generator).td.item() == pytest.approx(dqn.td.item(), rel=1e-4)
+    warm = replace(plain, munchausen_weight=0.9, munchausen_temperature=0.5)
+    assert q_loss(network, target, batch, warm, generator).td.item() != pytest.approx(dqn.td.item(), rel=1e-2)
 
 
 def test_td_error_by_hand():

@@ -187,6 +187,12 @@ class LossConfig:
     """Rewards summed before bootstrapping; never across the end of an episode."""
     double: bool = True
     """Double DQN: the online network chooses the next action, the target network values it."""
+    munchausen_weight: float = 0.0
+    """Above 0, Munchausen DQN (Vieillard et al., 2020): the target gets this share of the log-probability of the action
+    taken, and is soft over the next actions; `double` then says nothing. It averages the errors of earlier
+    estimates, which tells apart actions that earn nearly the same."""
+    munchausen_temperature: float = 0.03
+    """Temperature of the softmax over Q-values in that target; in units of the reward."""
     td_error: Literal["huber", "squared"] = "squared"
     """Squared as equation 2 prints it, or Huber with threshold 1 as d3rlpy has it. Huber counts a crash, an error of
     several units, for little more than a slip: it learns something near the median, where a crash is rare."""
@@ -568,6 +574,18 @@ def validate(config: Config) -> Config:
         checks += [
             (0 <= loss.discount <= 1, f"{name}.loss.discount", loss.discount, "between 0 and 1"),
             (loss.n_step >= 1, f"{name}.loss.n_step", loss.n_step, "at least 1"),
+            (
+                0 <= loss.munchausen_weight < 1,
+                f"{name}.loss.munchausen_weight",
+                loss.munchausen_weight,
+                "in [0, 1): from 1 on values grow without limit",
+            ),
+            (
+                loss.munchausen_temperature > 0,
+                f"{name}.loss.munchausen_temperature",
+                loss.munchausen_temperature,
+                "above 0",
+            ),
             (loss.temperature > 0, f"{name}.loss.temperature", loss.temperature, "above 0"),
             (loss.robust.radius >= 0, f"{name}.loss.robust.radius", loss.robust.radius, "at least 0"),
             (loss.robust.steps >= 1, f"{name}.loss.robust.steps", loss.robust.steps, "at least 1"),

@@ -17,6 +17,9 @@ from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork
 from rapid.scenarios import NUM_ACTIONS
 
+LOG_FLOOR = -1.0
+"""Least temperature * log-probability that a Munchausen target adds, before its weight (Vieillard et al., 2020)."""
+
 
 class QLoss(NamedTuple):
     """The terms of a loss before their weights, and the weighted total; scalars."""
@@ -46,7 +49,10 @@ def q_loss(
     Raises:
         RapidError: soft labels are asked for, but the batch has none.
     """
-    target_B = td_target(network, target_network, batch, config.double)
+    if config.munchausen_weight:
+        target_B = munchausen_target(target_network, batch, config.munchausen_weight, config.munchausen_temperature)
+    else:
+        target_B = td_target(network, target_network, batch, config.double)
     zero = torch.zeros((), device=target_B.device)
     attacked = _attack(network, batch, config, generator) if config.robust_weight else None
     if attacked is None:
@@ -73,6 +79,30 @@ def td_target(
     next_q_BA = target_network(batch.next_obs_BVF)
     next_value_B = _taken(next_q_BA, network(batch.next_obs_BVF).argmax(1)) if double else next_q_BA.amax(1)
     return batch.reward_B + batch.bootstrap_B * next_value_B
+
+
+@torch.no_grad()
+def munchausen_target(
+    target_network: Callable[[Tensor], Tensor], batch: TransitionBatch, weight: float, temperature: float
+) -> Tensor:
+    """Return the target of Munchausen DQN (B,), with pi = softmax(Q_target / temperature).
+
+    r + weight * max(temperature * log pi(a|s), -1) + bootstrap * sum_a' pi(a'|s') (Q_target - temperature * log pi)(s',
+    a'): equation 2 of Vieillard et al. (2020), "Munchausen Reinforcement Learning". Over n steps, the first action's
+    probability alone is added.
+
+    Args:
+        target_network: the slow copy, which also gives the probabilities.
+        batch: the transitions.
+        weight: their alpha.
+        temperature: their tau, in units of the reward.
+    """
+    # One pass over both ends of the transitions is faster than two.
+    q_BA, next_q_BA = target_network(torch.cat([batch.obs_BVF, batch.next_obs_BVF])).chunk(2)
+    log_taken_B = _taken((q_BA / temperature).log_softmax(1), batch.action_B)
+    next_value_B = temperature * (next_q_BA / temperature).logsumexp(1)
+    bonus_B = (temperature * log_taken_B).clamp_min(LOG_FLOOR)
+    return batch.reward_B + weight * bonus_B + batch.bootstrap_B * next_value_B
 
 
 def td_loss(q_BA: Tensor, action_B: Tensor, target_B: Tensor, kind: Literal["huber", "squared"]) -> Tensor:
