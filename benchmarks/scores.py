@@ -16,21 +16,23 @@ import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from rapid import pipeline
-from rapid.config import AdaptConfig, Config, TeacherConfig, preset, to_dict
+from rapid.config import AdaptConfig, Config, TeacherConfig, apply_overrides, preset, to_dict
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder
+from rapid.errors import RapidError
 from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import evaluate_agent
 from rapid.evaluation.statistics import Estimate, paired_difference
 from rapid.evaluation.summary import summary_text
 from rapid.files import write_text
+from rapid.networks.agent import load_agent
 from rapid.progress import task
 from rapid.runs import commit
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
@@ -98,7 +100,7 @@ def train(
     offline_agents = offline_recipes(config) | (offline_ablations(config) if ablations else {})
     for name, settings in offline_agents.items():
         home = work / file_name(name)
-        if not (home / "agent" / "config.json").exists():
+        if not is_trained(home, settings, "distill"):
             pipeline.distill_agent(settings, mixture, home, name)
         agents.append((name, home / "agent"))
     for steps in budgets:
@@ -124,11 +126,32 @@ def train(
                 f"RAPID, {short(steps)}, from scratch": (replace(adapt, train="scratch"), work / "distilled", mixture),
             }
         for name, (settings, origin, offline) in online.items():
-            home = work / scenario / file_name(name)
-            if not (home / "agent" / "config.json").exists():
-                pipeline.adapt_agent(replace(config, adapt=settings), origin / "agent", offline, home, name)
+            home, own = work / scenario / file_name(name), replace(config, adapt=settings)
+            if not is_trained(home, own, "adapt"):
+                pipeline.adapt_agent(own, origin / "agent", offline, home, name)
             agents.append((name, home / "agent"))
     return agents
+
+
+def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -> bool:
+    """Return whether the agent in `home` is there.
+
+    Raises:
+        RapidError: it was trained with other settings.
+    """
+    if not (home / "agent" / "config.json").exists():
+        return False
+    # What the agent was written without had its default.
+    saved = apply_overrides(preset(config.recipe, config.scale), load_agent(home / "agent").metadata["config"])
+    for part in ("network", phase):
+        before, now = (flatten(to_dict(getattr(each, part))) for each in (saved, config))
+        for name, value in now.items():
+            if before[name] != value:
+                raise RapidError(
+                    f"The agent in '{home}' was trained with {part}.{name} = {before[name]}, not {value}. Name another "
+                    "--work, or move that directory away."
+                )
+    return True
 
 
 def boldly(adapt: AdaptConfig) -> AdaptConfig:
@@ -334,4 +357,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except RapidError as error:
+        raise SystemExit(f"error: {error}") from None
