@@ -113,13 +113,17 @@ def train(
             exploration_start=1.0,
             exploration_end=0.05,
             offline_share=0.0,
-            loss=replace(adapt.loss, conservative_weight=0.0, double=True),
-            optimizer=replace(adapt.optimizer, learning_rate=5e-4, batch_size=config.adapt.optimizer.batch_size),
+            loss=replace(adapt.loss, conservative_weight=0.0, double=True, munchausen_weight=0.0),
+            optimizer=replace(adapt.optimizer, learning_rate=5e-4),
         )
         online = {
             f"RAPID, {short(steps)}": (adapt, work / "distilled", mixture),
             f"online DDQN, {short(steps)}": (from_scratch, work / "offline-DDQN", None),
         }
+        if adapt.loss.munchausen_weight:
+            # The same as RAPID in everything but the network and where it starts.
+            same = replace(from_scratch, loss=adapt.loss)
+            online[f"online Munchausen DQN, {short(steps)}"] = (same, work / "offline-DDQN", None)
         if ablations:
             online |= {
                 f"RAPID, {short(steps)}, fine-tuned whole": (replace(adapt, train="all"), work / "distilled", mixture),
@@ -155,16 +159,23 @@ def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -
 
 
 def boldly(adapt: AdaptConfig) -> AdaptConfig:
-    """Return the settings for many steps: nothing holds the policy to the data, it explores more and learns slower."""
+    """Return the settings for many steps: nothing holds the policy to the data, and it tries much more."""
     return replace(
         adapt,
         num_envs=20,
         updates_per_step=0.3,
-        exploration_start=0.2,
+        exploration_start=1.0,
         exploration_end=0.05,
+        exploration_hold=5,
         offline_share=0.0,
-        loss=replace(adapt.loss, conservative_weight=0.0, td_error="huber"),
-        optimizer=replace(adapt.optimizer, learning_rate=1.5e-4, batch_size=32),
+        loss=replace(
+            adapt.loss,
+            conservative_weight=0.0,
+            td_error="huber",
+            munchausen_weight=0.9,
+            munchausen_temperature=0.02,
+        ),
+        optimizer=replace(adapt.optimizer, learning_rate=5e-4),
     )
 
 

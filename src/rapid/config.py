@@ -269,6 +269,8 @@ class AdaptConfig:
     """epsilon after the schedule."""
     exploration_share: float = 0.2
     """Share of the steps over which epsilon falls."""
+    exploration_hold: int = 1
+    """A random action is held for up to so many steps, and is chosen as much less often; 1 is plain epsilon-greedy."""
     offline_share: float = 0.5
     """Share of each batch taken from the offline data; whatever `loss.n_step`, over one step."""
     train: Literal["adapter", "all", "scratch"] = "adapter"
@@ -559,6 +561,7 @@ def validate(config: Config) -> Config:
         (config.adapt.steps >= 1, "adapt.steps", config.adapt.steps, "at least 1"),
         (config.adapt.evaluate_every >= 0, "adapt.evaluate_every", config.adapt.evaluate_every, "at least 0"),
         (config.adapt.buffer_size >= 1, "adapt.buffer_size", config.adapt.buffer_size, "at least 1"),
+        (config.adapt.exploration_hold >= 1, "adapt.exploration_hold", config.adapt.exploration_hold, "at least 1"),
         (config.adapt.learning_starts >= 0, "adapt.learning_starts", config.adapt.learning_starts, "at least 0"),
         (config.teacher.concurrency >= 1, "teacher.concurrency", config.teacher.concurrency, "at least 1"),
         (config.teacher.max_turns >= 1, "teacher.max_turns", config.teacher.max_turns, "at least 1"),

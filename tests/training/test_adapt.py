@@ -12,7 +12,7 @@ from rapid.errors import RapidError
 from rapid.training import adapt, online
 from rapid.training.learner import Learner
 from rapid.training.online import exploration
-from rapid.training.worlds import epsilon_greedy
+from rapid.training.worlds import Explorer
 
 SCENARIO = "lane-3-density-2"
 CONFIG = AdaptConfig(
@@ -23,6 +23,7 @@ CONFIG = AdaptConfig(
     buffer_size=60,
     learning_starts=20,
     evaluate_every=30,
+    exploration_hold=3,
     loss=replace(LOSS, conservative_weight=0.0, robust_weight=0.0, n_step=2),
     optimizer=OptimizerConfig(batch_size=8),
 )
@@ -168,14 +169,33 @@ def test_exploration_falls_from_end_to_end():
 
 def test_epsilon_is_the_share_of_random_actions():
     net = network("mlp")
-    obs = fake_transitions(200).obs_NVF
-    greedy = epsilon_greedy(net, obs, 0.0, np.random.default_rng(0), "cpu")
-    np.testing.assert_array_equal(greedy, net(torch.from_numpy(obs)).argmax(1))
+    obs = fake_transitions(20).obs_NVF
     rng = np.random.default_rng(0)
-    other = epsilon_greedy(net, obs, 1.0, rng, "cpu")
-    assert np.bincount(other, minlength=5).min() > 300
-    some = epsilon_greedy(net, obs, 0.25, rng, "cpu")
-    assert (some != greedy).mean() == pytest.approx(0.25 * 0.8, abs=0.04)
+    greedy = Explorer(200).act(net, obs, 0.0, rng, "cpu")
+    np.testing.assert_array_equal(greedy, net(torch.from_numpy(obs)).argmax(1))
+    other = Explorer(200).act(net, obs, 1.0, rng, "cpu")
+    assert np.bincount(other, minlength=5).min() > 20
+    for longest in (1, 5):
+        explorer = Explorer(200, longest)
+        some = np.stack([explorer.act(net, obs, 0.25, rng, "cpu") for _ in range(100)])
+        assert (some != greedy).mean() == pytest.approx(0.25 * 0.8, abs=0.02)
+
+
+def test_random_actions_are_held_for_every_number_of_steps_up_to_the_longest():
+    net = network("mlp")
+    obs = fake_transitions(40).obs_NVF
+    greedy = Explorer(400).act(net, obs, 0.0, np.random.default_rng(0), "cpu")
+    explorer, rng = Explorer(400, 4), np.random.default_rng(1)
+    strange = np.stack([explorer.act(net, obs, 0.02, rng, "cpu") for _ in range(200)])
+    lengths = []
+    for world in range(400):
+        column = strange[:, world]
+        edges = np.flatnonzero(np.diff(column)) + 1
+        lengths += [len(run) for run in np.split(column, edges)[1:-1] if run[0] != greedy[world]]
+    counts = np.bincount(lengths, minlength=5)[1:5] / len(lengths)
+    # Two runs of the same action now and then follow each other at once.
+    assert counts.sum() > 0.98
+    assert counts == pytest.approx(0.25, abs=0.05)
 
 
 def test_settings_that_do_not_fit_are_refused(tmp_path):

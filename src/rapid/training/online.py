@@ -16,7 +16,7 @@ from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import Learner
 from rapid.training.offline import check_labels, data_fingerprint
 from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
-from rapid.training.worlds import Drive, MakeWorlds, epsilon_greedy
+from rapid.training.worlds import Drive, Explorer, MakeWorlds
 
 LOG_EVERY = 1_000
 """Environment steps between two lines of metrics."""
@@ -88,6 +88,7 @@ def adapt(
     sampler = OfflineSampler(offline, loss.discount, 1, device) if offline and offline_count else None
     rng = numpy_stream(seed, "adapt/exploration and batches")
     drive = Drive(make_worlds or _default_worlds(scenario), worlds_count, seed)
+    explorer = Explorer(worlds_count, config.exploration_hold)
     steps = 0
 
     def state() -> dict[str, Any]:
@@ -96,6 +97,7 @@ def adapt(
             "buffer": buffer.state_dict(),
             "rng": rng.bit_generator.state,
             "drive": drive.state_dict(),
+            "explorer": explorer.state_dict(),
             "steps": steps,
         }
 
@@ -104,13 +106,14 @@ def adapt(
         buffer.load_state_dict(saved["buffer"])
         rng.bit_generator.state = saved["rng"]
         drive.load_state_dict(saved["drive"])
+        explorer.load_state_dict(saved["explorer"])
         steps = saved["steps"]
         if progress:
             progress.skip(steps)
 
     while steps < total_steps:
         epsilon = exploration(config, steps)
-        action_W = epsilon_greedy(network, drive.obs_WVF, epsilon, rng, device)
+        action_W = explorer.act(network, drive.obs_WVF, epsilon, rng, device)
         buffer.add(*drive.step(action_W))
         steps += worlds_count
 

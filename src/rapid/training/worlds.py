@@ -16,17 +16,50 @@ MakeWorlds = Callable[[int], Any]
 """Gives a vector environment of so many worlds with SAME_STEP autoreset."""
 
 
-def epsilon_greedy(
-    network: QNetwork, obs_WVF: NDArray[np.float32], epsilon: float, rng: np.random.Generator, device: str
-) -> NDArray[np.int64]:
-    """Return the greedy action of each world or, with probability `epsilon`, a uniformly random one."""
-    explores_W = rng.random(len(obs_WVF)) < epsilon
-    action_W = rng.integers(NUM_ACTIONS, size=len(obs_WVF))
-    if not explores_W.all():
+class Explorer:
+    """Epsilon-greedy, whose random actions may be held for a while ("temporally extended", Dabney et al., 2021).
+
+    A car that stands needs four decisions in a row to be as fast as the traffic; chosen one by one at random, they
+    hardly ever come together.
+
+    Args:
+        num_envs: worlds that are driven together.
+        longest: a random action is held for 1 to so many steps, each as likely; 1 is plain epsilon-greedy.
+    """
+
+    def __init__(self, num_envs: int, longest: int = 1) -> None:
+        self._longest = longest
+        self._held_W = np.zeros(num_envs, np.int64)
+        # Steps for which the action is still held.
+        self._left_W = np.zeros(num_envs, np.int64)
+
+    def act(
+        self, network: QNetwork, obs_WVF: NDArray[np.float32], epsilon: float, rng: np.random.Generator, device: str
+    ) -> NDArray[np.int64]:
+        """Return the greedy action of each world or, in a share `epsilon` of all steps, a random or held one."""
+        count = len(obs_WVF)
+        # With runs of m steps in the mean, runs that begin with this probability after a greedy step fill that share.
+        begin = epsilon / (epsilon + (1 - epsilon) * (1 + self._longest) / 2)
+        begins_W = (rng.random(count) < begin) & (self._left_W == 0)
+        action_W = rng.integers(NUM_ACTIONS, size=count)
+        length_W = rng.integers(1, self._longest, size=count, endpoint=True) if self._longest > 1 else 1
+        self._held_W = np.where(begins_W, action_W, self._held_W)
+        self._left_W = np.where(begins_W, length_W, self._left_W)
+        explores_W = self._left_W > 0
+        self._left_W = np.maximum(self._left_W - 1, 0)
+        if explores_W.all():
+            return self._held_W
         with torch.inference_mode():
             greedy_W = network(torch.from_numpy(obs_WVF).to(device)).argmax(1).cpu().numpy()
-        action_W = np.where(explores_W, action_W, greedy_W)
-    return action_W
+        return np.where(explores_W, self._held_W, greedy_W)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that `load_state_dict` needs."""
+        return {"held": self._held_W, "left": self._left_W}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Hold what was held."""
+        self._held_W, self._left_W = state["held"], state["left"]
 
 
 class Drive:
