@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rapid import pipeline
-from rapid.config import AdaptConfig, Config, TeacherConfig, apply_overrides, preset, to_dict
+from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder
@@ -42,7 +42,7 @@ from rapid.teacher import make_teacher
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
 LONG = 50_000
-"""Online steps from which on RAPID is not held to the data any more (:func:`boldly`)."""
+"""Online steps from which on the settings are those of the scale `long`."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
@@ -104,9 +104,8 @@ def train(
             pipeline.distill_agent(settings, mixture, home, name)
         agents.append((name, home / "agent"))
     for steps in budgets:
-        adapt = replace(config.adapt, scenario=scenario, steps=steps)
-        if config.recipe == "strong" and steps >= LONG:
-            adapt = boldly(adapt)
+        adapt = preset(config.recipe, "long" if steps >= LONG else "full").adapt
+        adapt = replace(adapt, scenario=scenario, steps=steps)
         from_scratch = replace(
             adapt,
             train="scratch",
@@ -158,31 +157,10 @@ def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -
     return True
 
 
-def boldly(adapt: AdaptConfig) -> AdaptConfig:
-    """Return the settings for many steps: nothing holds the policy to the data, and it tries much more."""
-    return replace(
-        adapt,
-        num_envs=20,
-        updates_per_step=0.3,
-        exploration_start=1.0,
-        exploration_end=0.05,
-        exploration_hold=5,
-        offline_share=0.0,
-        loss=replace(
-            adapt.loss,
-            conservative_weight=0.0,
-            td_error="huber",
-            munchausen_weight=0.9,
-            munchausen_temperature=0.02,
-        ),
-        optimizer=replace(adapt.optimizer, learning_rate=5e-4),
-    )
-
-
-def differing(adapt: AdaptConfig) -> str:
-    """Return what :func:`boldly` sets otherwise, as settings with their values."""
-    before, after = flatten(to_dict(adapt)), flatten(to_dict(boldly(adapt)))
-    return ", ".join(f"`{name}` {value}" for name, value in after.items() if value != before[name])
+def differing(recipe: str) -> str:
+    """Return what phase 3 has otherwise at the scale `long`, as settings with their values."""
+    before, after = (flatten(to_dict(preset(recipe, scale).adapt)) for scale in ("full", "long"))
+    return ", ".join(f"`{name}` {value}" for name, value in after.items() if value != before[name] and name != "steps")
 
 
 def flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
@@ -276,7 +254,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        + (f"From {short(LONG)} steps on: {differing(config.adapt)}. " if config.recipe == "strong" else "")
+        + (f"From {short(LONG)} steps on: {differing(config.recipe)}. " if config.recipe == "strong" else "")
         + "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",

@@ -53,6 +53,16 @@ def test_the_paper_recipe_is_the_printed_one():
     assert (paper.adapt.exploration_start, paper.adapt.exploration_end, paper.adapt.buffer_size) == (1, 0.05, 100_000)
 
 
+def test_long_adaptation_differs_in_phase_3_alone_and_the_paper_stays_as_printed():
+    for recipe in settings.RECIPES:
+        full, long = preset(recipe, "full"), preset(recipe, "long")
+        assert dataclasses.replace(long, scale="full", adapt=full.adapt) == full
+        assert long.adapt.steps == 10 * full.adapt.steps
+    assert preset("paper", "long").adapt == dataclasses.replace(preset("paper", "full").adapt, steps=100_000)
+    strong = preset("strong", "long").adapt
+    assert (strong.offline_share, strong.loss.conservative_weight, strong.exploration_hold) == (0, 0, 5)
+
+
 def test_every_field_has_a_docstring():
     kinds = [kind for kind in vars(settings).values() if dataclasses.is_dataclass(kind)]
     assert len(kinds) > 8

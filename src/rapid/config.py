@@ -2,8 +2,8 @@
 
 A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
 ``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
-``quick`` (a coffee), ``full`` (the paper's seeds and iterations). Precedence, low to high: recipe and scale,
-``--config FILE.toml``, options. This module imports nothing heavy.
+``quick`` (a coffee), ``full`` (the paper's iterations), ``long`` (ten times the paper's online steps). Precedence, low
+to high: recipe and scale, ``--config FILE.toml``, options. This module imports nothing heavy.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from rapid.errors import RapidError, did_you_mean
 from rapid.scenarios import get_scenario
 
 Recipe = Literal["paper", "strong"]
-Scale = Literal["tiny", "quick", "full"]
+Scale = Literal["tiny", "quick", "full", "long"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
 
@@ -393,6 +393,8 @@ def _resize(config: Config) -> Config:
     """Apply the sizes of a scale; `full` keeps those of the recipe."""
     if config.scale == "full":
         return config
+    if config.scale == "long":
+        return replace(config, adapt=_lengthen(config.adapt, bold=config.recipe == "strong"))
     tiny = config.scale == "tiny"
     teacher, random = (60, 180) if tiny else (2_000, 6_000)
     return replace(
@@ -418,6 +420,30 @@ def _resize(config: Config) -> Config:
             planner_spawns=2 if tiny else 12,
             curve_spawns=2 if tiny else 20,
         ),
+    )
+
+
+def _lengthen(adapt: AdaptConfig, bold: bool) -> AdaptConfig:
+    """Return phase 3 with ten times the steps; if `bold`, nothing holds it to the data any more and it tries much."""
+    adapt = replace(adapt, steps=100_000)
+    if not bold:
+        return adapt
+    return replace(
+        adapt,
+        num_envs=20,
+        updates_per_step=0.3,
+        exploration_start=1.0,
+        exploration_end=0.05,
+        exploration_hold=5,
+        offline_share=0.0,
+        loss=replace(
+            adapt.loss,
+            conservative_weight=0.0,
+            td_error="huber",
+            munchausen_weight=0.9,
+            munchausen_temperature=0.02,
+        ),
+        optimizer=replace(adapt.optimizer, learning_rate=5e-4),
     )
 
 

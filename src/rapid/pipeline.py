@@ -530,7 +530,7 @@ def write_run_report(config: Config, directory: Path) -> Path:
     measured = read_json(steps["evaluate"]) if steps["evaluate"].exists() else {}
     if "note" in measured:
         notes.append(measured["note"])
-    if config.scale != "full":
+    if config.scale in ("tiny", "quick"):
         notes.append(f"Scale {config.scale}: one training seed and few spawns. This shows that it works, not how well.")
     data = ReportData(
         title=f"RAPID on {config.adapt.scenario or config.scenario}",
