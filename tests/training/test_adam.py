@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 
-from rapid.training.adam import Adam, clip_norm
+from rapid.training.adam import Adam, clip_norm, flush_denormals
 
 
 def weights() -> list[torch.Tensor]:
@@ -63,3 +63,29 @@ def test_a_saved_optimiser_goes_on_as_the_original():
     for optimizer in (adam, copied):
         optimizer.step(gradients(9), 1e-2)
     assert all(map(torch.equal, ours, theirs))
+
+
+def test_the_averages_of_weights_without_gradient_reach_zero_and_the_process_is_left_as_it_was():
+    if not torch.set_flush_denormal(False):
+        pytest.skip("this processor has no such mode")
+    tiny = torch.full((1,), 1e-40)
+
+    def mean_after(steps):
+        weight = torch.zeros(1)
+        adam = Adam([weight])
+        adam.step([torch.ones(1)], 1e-3)
+        for _ in range(steps):
+            adam.step([torch.zeros(1)], 1e-3)
+        return adam.state_dict()["mean"][0].item()
+
+    assert 0 < mean_after(850) < 1.2e-38
+    with flush_denormals():
+        assert mean_after(850) == 0
+    assert (tiny * 1).item() > 0
+    torch.set_flush_denormal(True)
+    try:
+        with flush_denormals():
+            pass
+        assert (tiny * 1).item() == 0
+    finally:
+        torch.set_flush_denormal(False)

@@ -4,7 +4,8 @@ The weights after a step are those of `torch.optim.Adam`, bit for bit. Its bookk
 where a network is as small as the baselines': a fifth of an update.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -13,6 +14,22 @@ from torch import Tensor
 BETAS = (0.9, 0.999)
 """Decay of the averages of the gradient and of its square."""
 EPSILON = 1e-8
+
+
+@contextmanager
+def flush_denormals() -> Generator[None]:
+    """Count numbers below 1.2e-38 as zero inside, as a decorator or in a `with`.
+
+    The averages of a weight that gets no gradient, behind a unit that has died, fade into such numbers, with which
+    processors are up to a hundred times slower: a baseline on raw inputs trains 1.7 times as fast without them.
+    """
+    # There is no way to ask but to try.
+    before = (torch.full((), 1e-40) * 1).item() == 0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
 
 
 class Adam:

@@ -16,12 +16,14 @@ from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, set_phase
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, torch_stream
+from rapid.training.adam import flush_denormals
 from rapid.training.learner import Learner
 from rapid.training.record import Evaluate, Record, Track, crossed, fingerprint, network_fingerprint
 
 LOG_EVERY = 100
 
 
+@flush_denormals()
 def distill(
     transitions: Transitions,
     network: QNetwork,

@@ -12,6 +12,7 @@ from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
+from rapid.training.adam import flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import Learner
 from rapid.training.offline import check_labels, data_fingerprint
@@ -22,6 +23,7 @@ LOG_EVERY = 1_000
 """Environment steps between two lines of metrics."""
 
 
+@flush_denormals()
 def adapt(
     network: QNetwork,
     config: AdaptConfig,
