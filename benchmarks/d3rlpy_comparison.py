@@ -7,12 +7,14 @@ scores d3rlpy's weights are put into our network, so that one program measures b
 
     python benchmarks/d3rlpy_comparison.py --losses
     python benchmarks/d3rlpy_comparison.py --speed --rounds 7
+    python benchmarks/d3rlpy_comparison.py --together --seeds 5 --iterations 10000
     python benchmarks/d3rlpy_comparison.py --scores --dataset RUN/mix --seeds 5 --iterations 10000 --spawns 200
 """
 
 import argparse
 import hashlib
 import json
+import multiprocessing
 import os
 import platform
 import subprocess
@@ -20,6 +22,7 @@ import sys
 import tempfile
 import time
 import venv
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -30,7 +33,7 @@ import torch
 
 from rapid.config import DistillConfig, NetworkConfig, preset
 from rapid.data.batch import TransitionBatch
-from rapid.data.dataset import Dataset, load_dataset
+from rapid.data.dataset import Dataset, load_dataset, save_dataset
 from rapid.data.exchange import export_d3rlpy
 from rapid.data.replay import OfflineSampler
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
@@ -211,6 +214,42 @@ def compare_speed(worker: Worker, dataset: Dataset, work: Path, rounds: int, ste
     return results
 
 
+def compare_together(worker: Worker, dataset: Dataset, work: Path, seeds: int, iterations: int) -> list[dict[str, Any]]:
+    """Return the seconds of several seeds: RAPID's a process each, all begun together, d3rlpy's one after another.
+
+    Ours count the start of the processes and reading the data; theirs only `fit`.
+    """
+    data = work / "data.h5"
+    export_d3rlpy(dataset, data)
+    save_dataset(dataset, work / "data")
+    results: list[dict[str, Any]] = []
+    with task("together", len(KINDS), "algorithms") as progress:
+        for kind in KINDS:
+            start = time.perf_counter()
+            with ProcessPoolExecutor(seeds, multiprocessing.get_context("spawn")) as pool:
+                ended = [
+                    pool.submit(train_alone, work / "data", kind, iterations, work / f"{kind}-together-{seed}", seed)
+                    for seed in range(seeds)
+                ]
+                for each in ended:
+                    each.result()
+            ours, theirs = time.perf_counter() - start, 0.0
+            for seed in range(seeds):
+                worker.ask("start", data=str(data), settings=their_settings(kind), seed=seed)
+                theirs += worker.ask("fit", steps=iterations)["seconds"]
+            results.append({"kind": kind, "rapid": ours, "d3rlpy": theirs, "ratio": theirs / ours})
+            progress.advance()
+    return results
+
+
+def train_alone(folder: Path, kind: str, iterations: int, directory: Path, seed: int) -> None:
+    """Train one seed, in a process of its own."""
+    torch.set_num_threads(1)
+    dataset = load_dataset(folder)
+    network = build_network(NETWORK, get_scenario(dataset.scenario).lanes, seed)
+    distill(dataset.transitions, network, settings(kind, iterations), directory, seed=seed)
+
+
 def compare_scores(
     worker: Worker, dataset: Dataset, work: Path, seeds: int, iterations: int, spawns: int, keep: Path
 ) -> list[EpisodeRow]:
@@ -299,7 +338,7 @@ def data_of(arguments: argparse.Namespace, work: Path) -> Dataset:
 def main() -> None:
     """Do what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    for name in ("losses", "speed", "scores"):
+    for name in ("losses", "speed", "together", "scores"):
         parser.add_argument(f"--{name}", action="store_true")
     parser.add_argument("--dataset", default="", help="directory of a dataset; by default random driving is collected")
     parser.add_argument("--venv", type=Path, default=cache_dir() / f"d3rlpy-{VERSION}")
@@ -312,8 +351,8 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=10_000)
     parser.add_argument("--spawns", type=int, default=200)
     arguments = parser.parse_args()
-    if not (arguments.losses or arguments.speed or arguments.scores):
-        parser.error("say what to compare: --losses, --speed or --scores")
+    if not (arguments.losses or arguments.speed or arguments.together or arguments.scores):
+        parser.error("say what to compare: --losses, --speed, --together or --scores")
     torch.set_num_threads(1)
     worker = Worker(arguments.venv)
     with tempfile.TemporaryDirectory() as folder:
@@ -353,6 +392,24 @@ def main() -> None:
                 speeds = f"{np.median(row['rapid']):.0f} | {np.median(row['d3rlpy']):.0f}"
                 lines.append(f"| {row['kind']} | {row['batch_size']} | {speeds} | {span} |")
             finish(arguments.out, "d3rlpy-speed", [*lines, "", told], {**about, "results": results})
+        if arguments.together:
+            results = compare_together(worker, dataset, work, arguments.seeds, arguments.iterations)
+            lines = [
+                "# Several seeds against d3rlpy",
+                "",
+                f"Seconds for {arguments.seeds} seeds of {arguments.iterations} updates on {os.cpu_count()} cores: "
+                "RAPID's a process each, all begun together, the start of the processes counted; d3rlpy's one after "
+                "another, `fit` alone.",
+                "",
+                "| | batch | RAPID | d3rlpy | ratio |",
+                "|---|---|---|---|---|",
+                *(
+                    f"| {row['kind']} | {BATCH_SIZE[row['kind']]} | {row['rapid']:.0f} | {row['d3rlpy']:.0f} | "
+                    f"{row['ratio']:.1f} |"
+                    for row in results
+                ),
+            ]
+            finish(arguments.out, "d3rlpy-together", [*lines, "", told], {**about, "results": results})
         if arguments.scores:
             sizes = (arguments.seeds, arguments.iterations, arguments.spawns)
             rows = compare_scores(worker, dataset, work, *sizes, arguments.work)
