@@ -275,6 +275,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
                 (name, teacher),
                 (name, "distilled"),
                 (name, name.replace("RAPID", "online DDQN")),
+                (name, name.replace("RAPID", "online Munchausen DQN")),
             ]
         for name, other in pairs:
             if other in clean and name in clean:
