@@ -1,11 +1,12 @@
 """The scores: RAPID and its baselines over several training seeds, from the shipped data, beside floors and ceiling.
 
 For every scenario and seed: phase 2 on the mixture of the scenario's own data (RAPID; MLPs by DQN, double DQN, CQL;
-behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a plain double-DQN MLP from scratch),
-then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on the data of
-that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call goes on
-where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw rows),
-`scores.md`. Of the floors and the planner it shows the rows in `floors.parquet`, which drove the same spawns.
+behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a double-DQN MLP from scratch that
+explores as RAPID does and, from 50,000 steps on, one with RAPID's loss as well), then all of them over the test spawns,
+clean and attacked. With `--data SCENARIO` all are trained offline on the data of that one scenario, and adapt to the
+others. Everything finished is kept under `--work`: an interrupted call goes on where it was, and calls for other seeds
+can run beside it. `--table` writes what is there: `scores.parquet` (raw rows), `scores.md`. Of the floors and the
+planner it shows the rows in `floors.parquet`, which drove the same spawns.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -120,7 +121,7 @@ def train(
             f"online DDQN, {short(steps)}": (from_scratch, work / "offline-DDQN", None),
         }
         if adapt.loss.munchausen_weight:
-            # The same as RAPID in everything but the network and where it starts.
+            # The same as RAPID but for the network, where it starts, and that nothing of it is frozen.
             same = replace(from_scratch, loss=adapt.loss)
             online[f"online Munchausen DQN, {short(steps)}"] = (same, work / "offline-DDQN", None)
         if ablations:
@@ -145,8 +146,9 @@ def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -
     if not (home / "agent" / "config.json").exists():
         return False
     # What the agent was written without had its default.
-    saved = apply_overrides(preset(config.recipe, config.scale), load_agent(home / "agent").metadata["config"])
-    for part in ("network", phase):
+    written = load_agent(home / "agent").metadata["config"]
+    saved = apply_overrides(preset(config.recipe, config.scale), written, source=f"the agent in '{home}'")
+    for part in ("mix", "network", "distill", phase):
         before, now = (flatten(to_dict(getattr(each, part))) for each in (saved, config))
         for name, value in now.items():
             if before[name] != value:
@@ -198,7 +200,7 @@ def measure(config: Config, agents: Iterable[tuple[str, Path]], work: Path, scen
     """Drive every agent that has not been driven."""
     for name, directory in agents:
         path = work / "rows" / f"{scenario}-{spawns}-{file_name(name)}.parquet"
-        if path.exists():
+        if path.exists() and path.stat().st_mtime > (directory / "config.json").stat().st_mtime:
             continue
         agent = open_agent(str(directory), scenario, config.seed)
         agent.name = name
@@ -255,6 +257,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
         + (f"From {short(LONG)} steps on: {differing(config.recipe)}. " if config.recipe == "strong" else "")
+        + "Online DDQN has no Munchausen term. "
         + "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",

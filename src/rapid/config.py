@@ -2,8 +2,8 @@
 
 A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
 ``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
-``quick`` (a coffee), ``full`` (the paper's iterations), ``long`` (ten times the paper's online steps). Precedence, low
-to high: recipe and scale, ``--config FILE.toml``, options. This module imports nothing heavy.
+``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (ten times its online steps). Precedence,
+low to high: recipe and scale, ``--config FILE.toml``, options. This module imports nothing heavy.
 """
 
 import dataclasses
@@ -188,9 +188,9 @@ class LossConfig:
     double: bool = True
     """Double DQN: the online network chooses the next action, the target network values it."""
     munchausen_weight: float = 0.0
-    """Above 0, Munchausen DQN (Vieillard et al., 2020): the target gets this share of the log-probability of the action
-    taken, and is soft over the next actions; `double` then says nothing. It averages the errors of earlier
-    estimates, which tells apart actions that earn nearly the same."""
+    """Above 0, Munchausen DQN (Vieillard et al., 2020): the target gets this share of temperature * log-probability of
+    the action taken (at least -1), and is soft over the next actions; `double` then says nothing. It averages the
+    errors of earlier estimates, which tells apart actions that earn nearly the same."""
     munchausen_temperature: float = 0.03
     """Temperature of the softmax over Q-values in that target; in units of the reward."""
     td_error: Literal["huber", "squared"] = "squared"
@@ -270,7 +270,8 @@ class AdaptConfig:
     exploration_share: float = 0.2
     """Share of the steps over which epsilon falls."""
     exploration_hold: int = 1
-    """A random action is held for up to so many steps, and is chosen as much less often; 1 is plain epsilon-greedy."""
+    """A random action is held for 1 to so many steps, and begun so rarely that epsilon stays the share of steps that
+    explore; 1 is plain epsilon-greedy."""
     offline_share: float = 0.5
     """Share of each batch taken from the offline data; whatever `loss.n_step`, over one step."""
     train: Literal["adapter", "all", "scratch"] = "adapter"
@@ -393,9 +394,10 @@ def _resize(config: Config) -> Config:
     """Apply the sizes of a scale; `full` keeps those of the recipe."""
     if config.scale == "full":
         return config
+    tiny, strong = config.scale == "tiny", config.recipe == "strong"
+    adapt = _boldly(config.adapt) if strong and not tiny else config.adapt
     if config.scale == "long":
-        return replace(config, adapt=_lengthen(config.adapt, bold=config.recipe == "strong"))
-    tiny = config.scale == "tiny"
+        return replace(config, adapt=replace(adapt, steps=100_000))
     teacher, random = (60, 180) if tiny else (2_000, 6_000)
     return replace(
         config,
@@ -408,10 +410,11 @@ def _resize(config: Config) -> Config:
         mix=replace(config.mix, size=int(min(teacher / config.mix.p, random / (1 - config.mix.p)))),
         distill=replace(config.distill, iterations=40 if tiny else 1_500, evaluate_every=20 if tiny else 300),
         adapt=replace(
-            config.adapt,
-            steps=200 if tiny else 8_000,
-            learning_starts=min(config.adapt.learning_starts, 50 if tiny else 500),
-            evaluate_every=100 if tiny else 1_000,
+            adapt,
+            # Driving is cheap here, and a tenth of these steps would add nothing to what was distilled.
+            steps=200 if tiny else 30_000 if strong else 8_000,
+            learning_starts=min(adapt.learning_starts, 50 if tiny else 500),
+            evaluate_every=100 if tiny else 2_000,
         ),
         evaluate=replace(
             config.evaluate,
@@ -423,11 +426,8 @@ def _resize(config: Config) -> Config:
     )
 
 
-def _lengthen(adapt: AdaptConfig, bold: bool) -> AdaptConfig:
-    """Return phase 3 with ten times the steps; if `bold`, nothing holds it to the data any more and it tries much."""
-    adapt = replace(adapt, steps=100_000)
-    if not bold:
-        return adapt
+def _boldly(adapt: AdaptConfig) -> AdaptConfig:
+    """Return phase 3 for many steps: nothing holds the policy to the data any more, and it tries much."""
     return replace(
         adapt,
         num_envs=20,
@@ -587,6 +587,14 @@ def validate(config: Config) -> Config:
         (config.adapt.steps >= 1, "adapt.steps", config.adapt.steps, "at least 1"),
         (config.adapt.evaluate_every >= 0, "adapt.evaluate_every", config.adapt.evaluate_every, "at least 0"),
         (config.adapt.buffer_size >= 1, "adapt.buffer_size", config.adapt.buffer_size, "at least 1"),
+        *(
+            (0 <= value <= 1, f"adapt.exploration_{name}", value, "between 0 and 1")
+            for name, value in (
+                ("start", config.adapt.exploration_start),
+                ("end", config.adapt.exploration_end),
+                ("share", config.adapt.exploration_share),
+            )
+        ),
         (config.adapt.exploration_hold >= 1, "adapt.exploration_hold", config.adapt.exploration_hold, "at least 1"),
         (config.adapt.learning_starts >= 0, "adapt.learning_starts", config.adapt.learning_starts, "at least 0"),
         (config.teacher.concurrency >= 1, "teacher.concurrency", config.teacher.concurrency, "at least 1"),
@@ -607,7 +615,7 @@ def validate(config: Config) -> Config:
                 0 <= loss.munchausen_weight < 1,
                 f"{name}.loss.munchausen_weight",
                 loss.munchausen_weight,
-                "in [0, 1): from 1 on values grow without limit",
+                "in [0, 1)",
             ),
             (
                 loss.munchausen_temperature > 0,

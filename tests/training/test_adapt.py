@@ -23,6 +23,8 @@ CONFIG = AdaptConfig(
     buffer_size=60,
     learning_starts=20,
     evaluate_every=30,
+    exploration_start=0.7,
+    exploration_end=0.7,
     exploration_hold=3,
     loss=replace(LOSS, conservative_weight=0.0, robust_weight=0.0, n_step=2),
     optimizer=OptimizerConfig(batch_size=8),
@@ -196,6 +198,39 @@ def test_random_actions_are_held_for_every_number_of_steps_up_to_the_longest():
     # Two runs of the same action now and then follow each other at once.
     assert counts.sum() > 0.98
     assert counts == pytest.approx(0.25, abs=0.05)
+
+
+def test_denormal_numbers_are_zero_while_training_and_never_after(tmp_path):
+    if not torch.set_flush_denormal(False):
+        pytest.skip("this processor has no such mode")
+    tiny, seen = torch.full((1,), 1e-40), []
+
+    def measured(net, steps):
+        seen.append((tiny * 1).item())
+        if steps == 60:
+            raise Killed
+        return {}
+
+    with pytest.raises(Killed):
+        train(tmp_path, evaluate=measured)
+    assert seen == [0, 0]
+    assert (tiny * 1).item() > 0
+
+
+def test_a_saved_explorer_goes_on_holding():
+    net, rng = network("mlp"), np.random.default_rng(0)
+    obs = fake_transitions(2).obs_NVF
+    explorer = Explorer(20, 6)
+    for _ in range(5):
+        explorer.act(net, obs, 0.5, rng, "cpu")
+    state = {name: value.copy() for name, value in explorer.state_dict().items()}
+    assert state["left"].max() > 1
+    other = Explorer(20, 6)
+    other.load_state_dict(state)
+    first, second = (each.act(net, obs, 0.5, np.random.default_rng(1), "cpu") for each in (explorer, other))
+    np.testing.assert_array_equal(first, second)
+    fresh = Explorer(20, 6).act(net, obs, 0.5, np.random.default_rng(1), "cpu")
+    assert (fresh != first).any()
 
 
 def test_settings_that_do_not_fit_are_refused(tmp_path):

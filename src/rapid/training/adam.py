@@ -18,10 +18,11 @@ EPSILON = 1e-8
 
 @contextmanager
 def flush_denormals() -> Generator[None]:
-    """Count numbers below 1.2e-38 as zero inside, as a decorator or in a `with`.
+    """Let this thread count denormal numbers (in float32 those below 1.2e-38) as zero, as a decorator or in a `with`.
 
     The averages of a weight that gets no gradient, behind a unit that has died, fade into such numbers, with which
-    processors are up to a hundred times slower: a baseline on raw inputs trains 1.7 times as fast without them.
+    processors are up to a hundred times slower: 3,000 updates of a baseline on raw inputs take 1.3 (CQL) to 1.7 times
+    (DQN) as long with them.
     """
     # There is no way to ask but to try.
     before = (torch.full((), 1e-40) * 1).item() == 0
