@@ -359,7 +359,7 @@ def main() -> None:
         work = Path(folder)
         dataset = data_of(arguments, work)
         about = machine(worker) | {"transitions": len(dataset), "scenario": dataset.scenario}
-        told = f"{about['processor']}, one thread; RAPID {about['rapid']}, d3rlpy {about['d3rlpy']}."
+        told = f"{about['processor']}, one thread a process; RAPID {about['rapid']}, d3rlpy {about['d3rlpy']}."
         told += f" Data: {len(dataset)} transitions, {dataset.scenario}."
         if arguments.losses:
             results = compare_losses(worker, dataset, work, arguments.batches)

@@ -411,7 +411,7 @@ def _resize(config: Config) -> Config:
         distill=replace(config.distill, iterations=40 if tiny else 1_500, evaluate_every=20 if tiny else 300),
         adapt=replace(
             adapt,
-            # Driving is cheap here, and a tenth of these steps would add nothing to what was distilled.
+            # More than `full` has: driving is cheap here, and the paper's 10,000 add nothing to what was distilled.
             steps=200 if tiny else 30_000 if strong else 8_000,
             learning_starts=min(adapt.learning_starts, 50 if tiny else 500),
             evaluate_every=100 if tiny else 2_000,
