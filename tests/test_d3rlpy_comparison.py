@@ -1,6 +1,8 @@
 """The comparison with d3rlpy, without d3rlpy: both sides get the same settings, batches and weights."""
 
 import importlib.util
+import json
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +11,7 @@ import pytest
 import torch
 
 from fake_worlds import fake_transitions
+from rapid.data.dataset import Dataset
 from rapid.data.replay import OfflineSampler
 from rapid.networks.q_network import build_network
 
@@ -58,6 +61,28 @@ def test_foreign_weights_drive_in_our_network(benchmark, roads, tmp_path):
     np.savez(tmp_path / "weights.npz", **arrays)
     benchmark.adopt(ours, tmp_path / "weights.npz")
     assert torch.equal(ours(roads(4)), theirs(roads(4)))
+
+
+def test_seeds_together_are_timed_against_fits_one_after_another(benchmark, tmp_path, monkeypatch):
+    asked = []
+
+    class FakeWorker:
+        def ask(self, do, **request):
+            asked.append((do, request.get("seed"), request.get("steps")))
+            return {"seconds": 50.0}
+
+    # The processes find their function by the module's name.
+    monkeypatch.syspath_prepend(PATH.parent)
+    monkeypatch.setitem(sys.modules, benchmark.__name__, benchmark)
+    monkeypatch.setattr(benchmark, "KINDS", ("dqn",))
+    dataset = Dataset("lane-3-density-2", fake_transitions(60), {})
+    (row,) = benchmark.compare_together(FakeWorker(), dataset, tmp_path, seeds=2, iterations=3)
+    assert asked == [("start", 0, None), ("fit", None, 3), ("start", 1, None), ("fit", None, 3)]
+    assert row["d3rlpy"] == 100
+    assert row["ratio"] == 100 / row["rapid"]
+    for seed in range(2):
+        last = (tmp_path / f"dqn-together-{seed}" / "metrics.jsonl").read_text().splitlines()[-1]
+        assert json.loads(last)["iteration"] == 3
 
 
 def test_the_table_says_whether_intervals_overlap(benchmark):
