@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rapid import pipeline
-from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict
+from rapid.config import AdaptConfig, Config, TeacherConfig, apply_overrides, preset, to_dict
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder
@@ -42,8 +42,8 @@ from rapid.teacher import make_teacher
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
-LONG = 50_000
-"""Online steps from which on the settings are those of the scale `long`."""
+SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
+"""From so many online steps on phase 3 has the settings of this scale, but for the steps."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
@@ -105,8 +105,7 @@ def train(
             pipeline.distill_agent(settings, mixture, home, name)
         agents.append((name, home / "agent"))
     for steps in budgets:
-        adapt = preset(config.recipe, "long" if steps >= LONG else "full").adapt
-        adapt = replace(adapt, scenario=scenario, steps=steps)
+        adapt = replace(adaptation(config.recipe, steps), scenario=scenario)
         from_scratch = replace(
             adapt,
             train="scratch",
@@ -137,6 +136,14 @@ def train(
     return agents
 
 
+def adaptation(recipe: str, steps: int) -> AdaptConfig:
+    """Return phase 3 for a number of online steps."""
+    scale = next(scale for least, scale in reversed(SETTINGS_FROM.items()) if steps >= least)
+    usual = preset(recipe, "full").adapt
+    sizes = {"steps": steps, "evaluate_every": usual.evaluate_every, "learning_starts": usual.learning_starts}
+    return replace(preset(recipe, scale).adapt, **sizes)
+
+
 def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -> bool:
     """Return whether the agent in `home` is there.
 
@@ -160,9 +167,16 @@ def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -
 
 
 def differing(recipe: str) -> str:
-    """Return what phase 3 has otherwise at the scale `long`, as settings with their values."""
-    before, after = (flatten(to_dict(preset(recipe, scale).adapt)) for scale in ("full", "long"))
-    return ", ".join(f"`{name}` {value}" for name, value in after.items() if value != before[name] and name != "steps")
+    """Return what phase 3 has otherwise for more steps, as settings with their values."""
+    told: list[str] = []
+    before = flatten(to_dict(adaptation(recipe, 0)))
+    for least in list(SETTINGS_FROM)[1:]:
+        after = flatten(to_dict(adaptation(recipe, least)))
+        changes = [f"`{name}` {value}" for name, value in after.items() if value != before[name] and name != "steps"]
+        if changes:
+            told.append(f"From {short(least)} steps on: {', '.join(changes)}. ")
+        before = after
+    return "".join(told)
 
 
 def flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
@@ -256,8 +270,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        + (f"From {short(LONG)} steps on: {differing(config.recipe)}. " if config.recipe == "strong" else "")
-        + "Online DDQN has no Munchausen term. "
+        f"{differing(config.recipe)}Online DDQN has no Munchausen term. "
         + "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
@@ -325,7 +338,9 @@ def main() -> None:
     parser.add_argument("--spawns", type=int, default=200, help="test spawns per agent")
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER_SCENARIOS), help="target scenarios")
     parser.add_argument("--recipe", default="strong", choices=("strong", "paper"), help="how things are trained")
-    parser.add_argument("--steps", type=int, nargs="*", default=[10_000, 100_000], help="online steps; may be none")
+    parser.add_argument(
+        "--steps", type=int, nargs="*", default=[10_000, 100_000, 300_000], help="online steps; may be none"
+    )
     parser.add_argument("--ablations", action="store_true", help="train RAPID without each of its parts as well")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")

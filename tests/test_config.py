@@ -57,8 +57,8 @@ def test_long_adaptation_differs_in_phase_3_alone_and_the_paper_stays_as_printed
     for recipe in settings.RECIPES:
         full, long = preset(recipe, "full"), preset(recipe, "long")
         assert dataclasses.replace(long, scale="full", adapt=full.adapt) == full
-        assert long.adapt.steps == 10 * full.adapt.steps
-    assert preset("paper", "long").adapt == dataclasses.replace(preset("paper", "full").adapt, steps=100_000)
+        assert long.adapt.steps == 30 * full.adapt.steps
+    assert preset("paper", "long").adapt == dataclasses.replace(preset("paper", "full").adapt, steps=300_000)
     strong = preset("strong", "long").adapt
     assert (strong.offline_share, strong.loss.conservative_weight, strong.exploration_hold) == (0, 0, 5)
 

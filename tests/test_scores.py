@@ -60,8 +60,10 @@ def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config
         "adapt_agent",
         lambda config, agent, data, out, name: asked.update({name: (config.adapt, agent, data)}),
     )
-    benchmark.train(config, "lane-3-density-2", tmp_path / "work", "lane-4-density-2.5", (10_000, 100_000), True)
-    for steps in ("10K", "100K"):
+    benchmark.train(
+        config, "lane-3-density-2", tmp_path / "work", "lane-4-density-2.5", (10_000, 100_000, 300_000), True
+    )
+    for steps in ("10K", "100K", "300K"):
         of_one = [adapt for name, (adapt, *_) in asked.items() if f", {steps}" in name]
         assert len({(a.steps, a.updates_per_step, a.optimizer.batch_size, a.num_envs) for a in of_one}) == 1
         assert {a.scenario for a in of_one} == {"lane-4-density-2.5"}

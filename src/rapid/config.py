@@ -2,7 +2,7 @@
 
 A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
 ``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
-``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (ten times its online steps). Precedence,
+``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps). Precedence,
 low to high: recipe and scale, ``--config FILE.toml``, options. This module imports nothing heavy.
 """
 
@@ -24,6 +24,9 @@ Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full", "long"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
+
+LONG_STEPS = 300_000
+"""Online steps of the scale `long`."""
 
 T = TypeVar("T")
 
@@ -397,7 +400,7 @@ def _resize(config: Config) -> Config:
     tiny, strong = config.scale == "tiny", config.recipe == "strong"
     adapt = _boldly(config.adapt) if strong and not tiny else config.adapt
     if config.scale == "long":
-        return replace(config, adapt=replace(adapt, steps=100_000))
+        return replace(config, adapt=_at_length(adapt) if strong else replace(adapt, steps=LONG_STEPS))
     teacher, random = (60, 180) if tiny else (2_000, 6_000)
     return replace(
         config,
@@ -444,6 +447,18 @@ def _boldly(adapt: AdaptConfig) -> AdaptConfig:
             munchausen_temperature=0.02,
         ),
         optimizer=replace(adapt.optimizer, learning_rate=5e-4),
+    )
+
+
+def _at_length(adapt: AdaptConfig) -> AdaptConfig:
+    """Return phase 3 for so many steps that it can look further ahead and needs fewer gradient steps for each."""
+    return replace(
+        adapt,
+        steps=LONG_STEPS,
+        buffer_size=LONG_STEPS,
+        updates_per_step=0.1,
+        exploration_share=0.3,
+        loss=replace(adapt.loss, discount=0.95),
     )
 
 
