@@ -2,8 +2,8 @@
 
 A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
 ``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
-``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps). Precedence,
-low to high: recipe and scale, ``--config FILE.toml``, options. This module imports nothing heavy.
+``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps).
+Precedence, low to high: recipe and scale, ``--config FILE.toml``, options. This module imports nothing heavy.
 """
 
 import dataclasses
