@@ -222,11 +222,14 @@ def compare_together(worker: Worker, dataset: Dataset, work: Path, seeds: int, i
     data = work / "data.h5"
     export_d3rlpy(dataset, data)
     save_dataset(dataset, work / "data")
+    # One process imports torch and RAPID, and the others are forked from it.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["rapid.training.offline", "rapid.data.exchange"])
     results: list[dict[str, Any]] = []
     with task("together", len(KINDS), "algorithms") as progress:
         for kind in KINDS:
             start = time.perf_counter()
-            with ProcessPoolExecutor(seeds, multiprocessing.get_context("spawn")) as pool:
+            with ProcessPoolExecutor(seeds, context) as pool:
                 ended = [
                     pool.submit(train_alone, work / "data", kind, iterations, work / f"{kind}-together-{seed}", seed)
                     for seed in range(seeds)
