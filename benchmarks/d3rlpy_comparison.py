@@ -43,7 +43,7 @@ from rapid.files import cache_dir, write_json, write_text
 from rapid.losses import q_loss
 from rapid.networks.agent import QAgent
 from rapid.networks.q_network import QNetwork, build_network
-from rapid.pipeline import collect_transitions
+from rapid.pipeline import baseline, collect_transitions
 from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import get_scenario
@@ -53,20 +53,13 @@ from rapid.training.offline import data_fingerprint, distill
 
 VERSION = "2.8.1"
 KINDS = ("dqn", "ddqn", "cql")
-LEARNING_RATE = {"dqn": 5e-3, "ddqn": 5e-4, "cql": 5e-4}
-"""As the paper prints them."""
-BATCH_SIZE = {"dqn": 32, "ddqn": 32, "cql": 64}
 PAPER = preset("paper", "full")
 NETWORK: NetworkConfig = replace(PAPER.network, kind="mlp")
 
 
 def settings(kind: str, iterations: int = 1) -> DistillConfig:
     """Return our settings of a baseline: recipe `paper`, without the robust term."""
-    base = PAPER.distill
-    weight = 1.0 if kind == "cql" else 0.0
-    loss = replace(base.loss, robust_weight=0.0, conservative_weight=weight, double=kind != "dqn")
-    optimizer = replace(base.optimizer, learning_rate=LEARNING_RATE[kind], batch_size=BATCH_SIZE[kind])
-    return replace(base, iterations=iterations, evaluate_every=0, loss=loss, optimizer=optimizer)
+    return replace(baseline(PAPER, kind).distill, iterations=iterations, evaluate_every=0)
 
 
 def their_settings(kind: str) -> dict[str, Any]:
@@ -203,7 +196,7 @@ def compare_speed(worker: Worker, dataset: Dataset, work: Path, rounds: int, ste
         results.append(
             {
                 "kind": kind,
-                "batch_size": BATCH_SIZE[kind],
+                "batch_size": settings(kind).optimizer.batch_size,
                 "rapid": ours,
                 "d3rlpy": theirs,
                 "ratio": float(np.median(ratios)),
@@ -240,7 +233,8 @@ def compare_together(worker: Worker, dataset: Dataset, work: Path, seeds: int, i
             for seed in range(seeds):
                 worker.ask("start", data=str(data), settings=their_settings(kind), seed=seed)
                 theirs += worker.ask("fit", steps=iterations)["seconds"]
-            results.append({"kind": kind, "rapid": ours, "d3rlpy": theirs, "ratio": theirs / ours})
+            size = settings(kind).optimizer.batch_size
+            results.append({"kind": kind, "batch_size": size, "rapid": ours, "d3rlpy": theirs, "ratio": theirs / ours})
             progress.advance()
     return results
 
@@ -407,7 +401,7 @@ def main() -> None:
                 "| | batch | RAPID | d3rlpy | ratio |",
                 "|---|---|---|---|---|",
                 *(
-                    f"| {row['kind']} | {BATCH_SIZE[row['kind']]} | {row['rapid']:.0f} | {row['d3rlpy']:.0f} | "
+                    f"| {row['kind']} | {row['batch_size']} | {row['rapid']:.0f} | {row['d3rlpy']:.0f} | "
                     f"{row['ratio']:.1f} |"
                     for row in results
                 ),

@@ -2,11 +2,12 @@
 
 For every scenario and seed: phase 2 on the mixture of the scenario's own data (RAPID; MLPs by DQN, double DQN, CQL;
 behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a double-DQN MLP from scratch that
-explores as RAPID does and, from 50,000 steps on, one with RAPID's loss as well), then all of them over the test spawns,
-clean and attacked. With `--data SCENARIO` all are trained offline on the data of that one scenario, and adapt to the
-others. Everything finished is kept under `--work`: an interrupted call goes on where it was, and calls for other seeds
-can run beside it. `--table` writes what is there: `scores.parquet` (raw rows), `scores.md`. Of the floors and the
-planner it shows the rows in `floors.parquet`, which drove the same spawns.
+explores as RAPID does and, from 50,000 steps on, one with RAPID's loss as well; in the recipe `paper` also a DQN as
+printed), then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on
+the data of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call
+goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw
+rows) and `scores.md`; for the recipe `paper` `scores-paper`, with the paper's numbers beside ours. Of the floors and
+the planner it shows the rows in `floors.parquet`, which drove the same spawns.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -35,6 +36,7 @@ from rapid.evaluation.summary import summary_text
 from rapid.files import write_text
 from rapid.networks.agent import load_agent
 from rapid.progress import task
+from rapid.report.data import paper_return
 from rapid.runs import commit
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 from rapid.spawns import spawn_seeds
@@ -44,25 +46,20 @@ ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
 SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
+MLP_DISCOUNT = 0.93
+"""Longest discount of the MLPs from scratch: with RAPID's 0.95 for many steps they earn less (docs/log.md)."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
 
 def offline_recipes(config: Config) -> dict[str, Config]:
     """Return the settings of every agent that is trained offline, by name."""
-    mlp = replace(config, network=replace(config.network, kind="mlp"))
-
-    def trained(alpha: float, double: bool, algorithm: str = "dqn") -> Config:
-        loss = replace(mlp.distill.loss, conservative_weight=alpha, robust_weight=0.0, double=double)
-        optimizer = replace(mlp.distill.optimizer, algorithm=algorithm)
-        return replace(mlp, distill=replace(mlp.distill, loss=loss, optimizer=optimizer))
-
     return {
         "distilled": config,
-        "offline DQN": trained(0.0, double=False),
-        "offline DDQN": trained(0.0, double=True),
-        "CQL": trained(1.0, double=False),
-        "behaviour cloning": trained(0.0, double=False, algorithm="bc"),
+        "offline DQN": pipeline.baseline(config, "dqn"),
+        "offline DDQN": pipeline.baseline(config, "ddqn"),
+        "CQL": pipeline.baseline(config, "cql"),
+        "behaviour cloning": pipeline.baseline(config, "bc"),
     }
 
 
@@ -106,13 +103,14 @@ def train(
         agents.append((name, home / "agent"))
     for steps in budgets:
         adapt = replace(adaptation(config.recipe, steps), scenario=scenario)
+        discount = adapt.loss.discount if config.recipe == "paper" else min(adapt.loss.discount, MLP_DISCOUNT)
         from_scratch = replace(
             adapt,
             train="scratch",
             exploration_start=1.0,
             exploration_end=0.05,
             offline_share=0.0,
-            loss=replace(adapt.loss, conservative_weight=0.0, double=True, munchausen_weight=0.0),
+            loss=replace(adapt.loss, conservative_weight=0.0, double=True, munchausen_weight=0.0, discount=discount),
             optimizer=replace(adapt.optimizer, learning_rate=5e-4),
         )
         online = {
@@ -121,8 +119,13 @@ def train(
         }
         if adapt.loss.munchausen_weight:
             # The same as RAPID but for the network, where it starts, and that nothing of it is frozen.
-            same = replace(from_scratch, loss=adapt.loss)
+            same = replace(from_scratch, loss=replace(adapt.loss, discount=discount))
             online[f"online Munchausen DQN, {short(steps)}"] = (same, work / "offline-DDQN", None)
+        if config.recipe == "paper":
+            rate = pipeline.baseline(config, "dqn").distill.optimizer.learning_rate
+            plain = replace(from_scratch.loss, double=False)
+            dqn = replace(from_scratch, loss=plain, optimizer=replace(from_scratch.optimizer, learning_rate=rate))
+            online[f"online DQN, {short(steps)}"] = (dqn, work / "offline-DQN", None)
         if ablations:
             online |= {
                 f"RAPID, {short(steps)}, fine-tuned whole": (replace(adapt, train="all"), work / "distilled", mixture),
@@ -264,14 +267,17 @@ def shown(number: Estimate, digits: int = 2) -> str:
 
 def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> str:
     """Return the tables as Markdown."""
+    mlps = f"Online DDQN has no Munchausen term, and no MLP a discount above {MLP_DISCOUNT}. "
+    if config.recipe == "paper":
+        mlps = "Step, batch and target updates of the baselines as the paper prints them. "
     lines = [
         "# Scores",
         "",
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        f"{differing(config.recipe)}Online DDQN has no Munchausen term. "
-        + "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
+        f"{differing(config.recipe)}{mlps}"
+        "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
     ]
@@ -282,6 +288,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
             for name in dict.fromkeys(row.agent for row in here)
         }
         lines += ["", f"## {scenario}", "", "```", summary_text(here), "```", ""]
+        if config.recipe == "paper":
+            lines += beside_paper(here, scenario)
         teacher = next((name for name, of in clean.items() if of and of[0].kind == "teacher"), None)
         adapted = [name for name in clean if name.startswith("RAPID")]
         pairs = [("distilled", "slower"), ("distilled", teacher)]
@@ -303,11 +311,26 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
             for name in ["distilled", *adapted]:
                 if name in clean:
                     reached = (float(np.mean(column(clean[name], "episode_return"))) - low) / (high - low)
-                    lines.append(
-                        f"- {name} has gone {reached:.0%} of the way from always-slower to the planner; aimed at: "
-                        f"{WAY.get(get_scenario(scenario).lanes, 0):.0%} within a million online steps."
-                    )
+                    aim = f"; aimed at: {WAY.get(get_scenario(scenario).lanes, 0):.0%} within a million online steps"
+                    told = aim if config.recipe == "strong" else ""
+                    lines.append(f"- {name} has gone {reached:.0%} of the way from always-slower to the planner{told}.")
     return "\n".join(lines) + "\n"
+
+
+def beside_paper(rows: list[EpisodeRow], scenario: str) -> list[str]:
+    """Return the lines of a table with the paper's numbers beside ours; nothing if it has none here."""
+    lines = ["| ours (the paper's) | " + " | ".join(ATTACKS) + " |", "|---" * (len(ATTACKS) + 1) + "|"]
+    for agent in dict.fromkeys(row.agent for row in rows):
+        cells: list[str] = []
+        for attack in ATTACKS:
+            returns = [row.episode_return for row in rows if row.agent == agent and row.attack == attack]
+            # The paper's online methods have 10,000 steps.
+            printed = paper_return(agent.removesuffix(", 10K"), get_scenario(scenario), attack)
+            told = f" ({printed.mean:.2f} ± {printed.spread:.2f})" if printed else ""
+            cells.append(f"{np.mean(returns):.2f}{told}" if returns else "–")
+        if any("(" in cell for cell in cells):
+            lines.append(f"| {agent} | {' | '.join(cells)} |")
+    return [*lines, ""] if len(lines) > 2 else []
 
 
 def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Config, out: Path) -> None:
@@ -324,7 +347,7 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
         rows += [row for row in floors if row.scenario == scenario] + here
     if not own:
         raise SystemExit(f"Nothing has been measured over {spawns} spawns under '{work}'. Train first: see --help.")
-    name = f"scores-from-{data}" if data else "scores"
+    name = "-".join(["scores", *(["paper"] if config.recipe == "paper" else []), *(["from", data] if data else [])])
     save_rows(out / f"{name}.parquet", own)
     command = " ".join(["python", "benchmarks/scores.py", *sys.argv[1:]])
     write_text(out / f"{name}.md", report(rows, config, data, command))

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -32,6 +32,7 @@ from rapid.networks.agent import QAgent, load_agent, save_agent
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.progress import format_seconds, task
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
+from rapid.reproduce import paper_numbers
 from rapid.runs import RunDirectory, commit
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
@@ -295,14 +296,34 @@ def _distill(config: Config, home: RunDirectory) -> dict[str, Any]:
     mixed = home.path / "mix"
     distill_agent(config, mixed, home.path / "distill" / "rapid", "distilled")
     # The two baselines that see the same data: what the method adds is the difference to them.
-    plain = replace(config.distill.loss, conservative_weight=0.0, robust_weight=0.0, double=False)
-    mlp = replace(config, network=replace(config.network, kind="mlp"))
-    q_learning = replace(config.distill.optimizer, algorithm="dqn")
-    dqn = replace(mlp, distill=replace(mlp.distill, loss=plain, optimizer=q_learning))
-    distill_agent(dqn, mixed, home.path / "distill" / "offline-dqn", "offline DQN")
-    cloning = replace(mlp.distill, optimizer=replace(mlp.distill.optimizer, algorithm="bc"))
-    distill_agent(replace(mlp, distill=cloning), mixed, home.path / "distill" / "cloning", "behaviour cloning")
+    distill_agent(baseline(config, "dqn"), mixed, home.path / "distill" / "offline-dqn", "offline DQN")
+    distill_agent(baseline(config, "bc"), mixed, home.path / "distill" / "cloning", "behaviour cloning")
     return {}
+
+
+def baseline(config: Config, algorithm: Literal["dqn", "ddqn", "cql", "bc"]) -> Config:
+    """Return the settings of an MLP that learns offline by another algorithm: the baselines.
+
+    They are those of RAPID but for what makes the algorithm; in the recipe `paper`, step size, batch and target updates
+    are what the paper's table prints for it. CQL builds on double DQN, as d3rlpy's does.
+    """
+    loss = replace(
+        config.distill.loss,
+        conservative_weight=1.0 if algorithm == "cql" else 0.0,
+        robust_weight=0.0,
+        double=algorithm in ("ddqn", "cql"),
+    )
+    optimizer = replace(config.distill.optimizer, algorithm="bc" if algorithm == "bc" else "dqn")
+    if config.recipe == "paper" and algorithm != "bc":
+        printed = paper_numbers()["hyperparameters"][algorithm]
+        optimizer = replace(
+            optimizer,
+            learning_rate=printed["learning_rate"],
+            batch_size=printed["batch_size"],
+            target_update=printed["target_update_interval"],
+        )
+    network = replace(config.network, kind="mlp")
+    return replace(config, network=network, distill=replace(config.distill, loss=loss, optimizer=optimizer))
 
 
 def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled") -> QAgent:

@@ -21,6 +21,9 @@ PAPER_METHODS: dict[str, tuple[str, str]] = {
     "offline dqn": ("attack", "Offline DQN"),
     "rapid without robust term": ("attack", "RAPID without robust term"),
     "distilled": ("offline", "rapid"),
+    "distilled, no j_robust": ("offline", "rapid_without_robust"),
+    "offline ddqn": ("offline", "ddqn"),
+    "cql": ("offline", "cql"),
 }
 """Where the paper has an agent's numbers, by the agent's name in small letters: a table, and its row or column."""
 
