@@ -177,3 +177,19 @@ def test_a_damaged_artefact_stops_the_run_and_is_left_as_it_is(config: Config, f
     with pytest.raises(RapidError, match="cut off"):
         pipeline.run(config, directory, say=lambda line: None)
     assert damaged.stat().st_size == 1000
+
+
+def test_baselines_have_the_papers_printed_sizes_in_its_recipe():
+    def sizes(recipe: str) -> dict[str, tuple[float, int, int]]:
+        found = {}
+        for name in ("dqn", "ddqn", "cql"):
+            optimizer = pipeline.baseline(preset(recipe, "full"), name).distill.optimizer
+            found[name] = (optimizer.learning_rate, optimizer.batch_size, optimizer.target_update)
+        return found
+
+    assert sizes("paper") == {"dqn": (5e-3, 32, 50), "ddqn": (5e-4, 32, 50), "cql": (5e-4, 64, 50)}
+    assert len(set(sizes("strong").values())) == 1
+    terms = {name: pipeline.baseline(preset("paper"), name).distill.loss for name in ("dqn", "ddqn", "cql", "bc")}
+    assert {name for name, loss in terms.items() if loss.conservative_weight} == {"cql"}
+    assert {name for name, loss in terms.items() if loss.double} == {"ddqn", "cql"}
+    assert not any(loss.robust_weight for loss in terms.values())

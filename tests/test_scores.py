@@ -4,13 +4,17 @@ import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rapid.config import preset, to_dict
 from rapid.errors import RapidError
+from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.agent import save_agent
 from rapid.networks.q_network import build_network
+from rapid.teacher.scripted import Scripted
 
+SCRIPTED = Scripted("slower", 3, 0)
 PATH = Path(__file__).parents[1] / "benchmarks" / "scores.py"
 
 
@@ -50,7 +54,9 @@ def test_a_setting_that_did_not_exist_yet_had_its_default(benchmark, config, tmp
     assert benchmark.is_trained(tmp_path, config, "adapt")
 
 
-def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config, tmp_path, monkeypatch):
+@pytest.fixture
+def asked(benchmark, tmp_path, monkeypatch):
+    """The trainings asked for online, instead of their being done: settings, where it starts, data, by name."""
     asked: dict[str, tuple] = {}
     monkeypatch.setattr(benchmark.pipeline, "mix_datasets", lambda *_: None)
     monkeypatch.setattr(benchmark, "datasets", lambda *_: (tmp_path, tmp_path))
@@ -60,6 +66,10 @@ def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config
         "adapt_agent",
         lambda config, agent, data, out, name: asked.update({name: (config.adapt, agent, data)}),
     )
+    return asked
+
+
+def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config, tmp_path, asked):
     benchmark.train(
         config, "lane-3-density-2", tmp_path / "work", "lane-4-density-2.5", (10_000, 100_000, 300_000), True
     )
@@ -73,3 +83,32 @@ def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config
         assert (baseline.loss.double, baseline.loss.munchausen_weight) == (True, 0.0)
     assert asked["online Munchausen DQN, 100K"][0].loss == asked["RAPID, 100K"][0].loss
     assert "online Munchausen DQN, 10K" not in asked
+    # Each looks as far ahead as is best for it.
+    discounts = {name: adapt.loss.discount for name, (adapt, *_) in asked.items() if ", 300K" in name}
+    assert discounts["RAPID, 300K"] == 0.95
+    assert discounts["online Munchausen DQN, 300K"] == discounts["online DDQN, 300K"] == benchmark.MLP_DISCOUNT
+
+
+def test_the_recipe_paper_has_its_online_dqn_as_printed(benchmark, tmp_path, asked):
+    benchmark.train(preset("paper", "full"), "lane-3-density-2", tmp_path, "lane-3-density-2", (10_000,), False)
+    assert list(asked) == ["RAPID, 10K", "online DDQN, 10K", "online DQN, 10K"]
+    rates = {name: (adapt.optimizer.learning_rate, adapt.loss.double) for name, (adapt, *_) in asked.items()}
+    assert rates["online DQN, 10K"] == (5e-3, False)
+    assert rates["online DDQN, 10K"] == (5e-4, True)
+    assert {adapt.loss.discount for adapt, *_ in asked.values()} == {0.99}
+
+
+def test_the_papers_numbers_stand_beside_ours(benchmark):
+    rows = [
+        *run_episodes(SCRIPTED, "lane-3-density-2", [0, 1]).rows(0),
+        *run_episodes(SCRIPTED, "lane-3-density-2", [0, 1], "uniform").rows(0),
+    ]
+    ours = [replace(row, agent="RAPID, 10K") for row in rows]
+    lines = benchmark.beside_paper([*ours, *(replace(row, agent="someone else") for row in rows)], "lane-3-density-2")
+    told = lines[2]
+    assert told.startswith("| RAPID, 10K | ")
+    assert "(20.42 ± 2.59)" in told
+    assert "(20.41 ± 1.58)" in told
+    assert f"{np.mean([row.episode_return for row in rows if row.attack == 'none']):.2f} (" in told
+    assert "someone else" not in "".join(lines)
+    assert benchmark.beside_paper(ours, "lane-3-density-2:progress") == []
