@@ -47,7 +47,7 @@ FLOORS = ("slower", "rule", "planner")
 SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
 MLP_DISCOUNT = 0.93
-"""Longest discount of the MLPs from scratch: with RAPID's 0.95 for many steps they earn less (docs/log.md)."""
+"""Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
