@@ -20,6 +20,7 @@ from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
 from rapid.data.journal import exclusive
 from rapid.data.sharding import collect_shards, shards_of
 from rapid.data.shipped import SHIPPED, shipped_sets
+from rapid.data.transitions import Transitions
 from rapid.engines import check_engine
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.agents import open_agent
@@ -335,7 +336,7 @@ def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled"
     tracker = Tracker(config.tracking, out, f"distill-{name}".replace(" ", "-"), to_dict(without_place(config)))
     with tracker, task(f"distill, {name}", config.distill.iterations, "iterations") as work:
         distill(
-            dataset.transitions,
+            _learnable(dataset),
             network,
             config.distill,
             out,
@@ -348,6 +349,11 @@ def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled"
     metadata = {"name": name, "phase": "distill", "data": str(data), "scenario": dataset.scenario, "seed": config.seed}
     save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
     return QAgent(network, name)
+
+
+def _learnable(dataset: Dataset) -> Transitions:
+    """Return the transitions as a trainer takes them."""
+    return dataset.transitions.timed() if get_scenario(dataset.scenario).clock else dataset.transitions
 
 
 def _curve(config: Config, scenario: str, name: str) -> Callable[[QNetwork, int], dict[str, float]] | None:
@@ -384,7 +390,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
             scenario,
             out,
             seed=stream_seed(config.seed, "adapt"),
-            offline=load_dataset(data).transitions if data else None,
+            offline=_learnable(load_dataset(data)) if data else None,
             evaluate=_curve(config, scenario, name),
             progress=work,
             make_worlds=lambda count: make_vec(scenario, count, simulator=config.simulator),

@@ -1,7 +1,7 @@
 """Named driving scenarios, as data (paper: section 4.1 and the table "Highway Environment Configuration").
 
-A name reads ``lane-N-density-D[-fast][:progress]``: N lanes, traffic density D, the dynamics of ``highway-v0``
-or, with ``-fast``, of ``highway-fast-v0``, and one of two rewards. This module imports nothing heavy.
+A name reads ``lane-N-density-D[-fast][:progress][:clock]``: N lanes, traffic density D, the dynamics of ``highway-v0``
+or, with ``-fast``, of ``highway-fast-v0``, one of two rewards, and whether the observation tells the time. This module imports nothing heavy.
 """
 
 import re
@@ -28,24 +28,28 @@ TARGET_SPEEDS = tuple(4.0 * i for i in range(9))
 
 PAPER_SCENARIOS = ("lane-3-density-2", "lane-4-density-2.5", "lane-5-density-3")
 
-_NAME = re.compile(r"lane-(\d+)-density-(\d+(?:\.\d+)?)(-fast)?(?::([a-z]+))?")
+_NAME = re.compile(r"lane-(\d+)-density-(\d+(?:\.\d+)?)(-fast)?(?::(normalized|progress))?(:clock)?")
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One driving task: the road, the traffic, the physics and the reward."""
+    """One driving task: the road, the traffic, the physics, the reward and what is seen of it."""
 
     lanes: int
     density: float
     dynamics: Dynamics = "v0"
     reward: Reward = "normalized"
+    clock: bool = False
+    """Whether the ego's presence, otherwise always 1, grows to 2 while the episode's time passes. What an episode still
+    pays depends on the time left, so without it the observation is not a state; for who sees it, the time limit is an
+    end like any other (Pardo et al., 2018, "Time Limits in Reinforcement Learning")."""
 
     @property
     def name(self) -> str:
         """The name that :func:`get_scenario` reads back."""
         fast = "-fast" if self.dynamics == "fast" else ""
         reward = "" if self.reward == "normalized" else f":{self.reward}"
-        return f"lane-{self.lanes}-density-{self.density:g}{fast}{reward}"
+        return f"lane-{self.lanes}-density-{self.density:g}{fast}{reward}{':clock' if self.clock else ''}"
 
     @property
     def env_id(self) -> str:
@@ -69,6 +73,8 @@ class Scenario:
             "duration": 30,
             "show_trajectories": True,
         }
+        if self.clock:
+            config["observation"]["clock"] = True
         if self.reward == "progress":
             # The paper's reward pays a parked car 0.67 a step; here only distance and not crashing count.
             config |= {
@@ -98,11 +104,11 @@ def get_scenario(name: str) -> Scenario:
         RapidError: the name does not follow the pattern, or asks for a road that cannot exist.
     """
     match = _NAME.fullmatch(name.strip())
-    if match is None or match[4] not in (None, "normalized", "progress"):
+    if match is None:
         raise RapidError(
             f"Unknown scenario '{name}'{did_you_mean(name, SCENARIOS)} Expected lane-N-density-D with an optional "
-            f"-fast and an optional :progress. Listed scenarios: {', '.join(SCENARIOS[:9])}; each also with -fast, "
-            "with :progress, or with both."
+            f"-fast, :progress and :clock, in this order. Listed scenarios: {', '.join(SCENARIOS[:9])}; each also with "
+            "any of the three."
         )
     lanes, density = int(match[1]), float(match[2])
     if not 1 <= lanes <= 20:
@@ -110,4 +116,4 @@ def get_scenario(name: str) -> Scenario:
     if not 0 < density <= 20:
         raise RapidError(f"Impossible scenario '{name}': the density must lie in (0, 20], not {match[2]}.")
     reward: Reward = "progress" if match[4] == "progress" else "normalized"
-    return Scenario(lanes, density, "fast" if match[3] else "v0", reward)
+    return Scenario(lanes, density, "fast" if match[3] else "v0", reward, clock=match[5] is not None)

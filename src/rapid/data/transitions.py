@@ -79,6 +79,10 @@ class Transitions:
         )
         return same
 
+    def timed(self) -> "Transitions":
+        """Return the transitions with the time limit as an end like any other: for observations that tell the time."""
+        return replace(self, terminated_N=self.done_N)
+
     def validate(self, what: str = "the transitions") -> "Transitions":
         """Return self if every array has its shape and type and every value makes sense.
 

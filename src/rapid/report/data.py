@@ -87,7 +87,7 @@ def paper_return(agent: str, scenario: Scenario, attack: str = "none") -> PaperR
     The paper's reward is the normalised one, and its offline table has no attacks.
     """
     place = PAPER_METHODS.get(agent.lower())
-    if place is None or scenario.reward != "normalized" or scenario.dynamics != "v0":
+    if place is None or scenario.reward != "normalized" or scenario.dynamics != "v0" or scenario.clock:
         return None
     table, key = place
     if table == "attack":

@@ -18,6 +18,7 @@ from rapid.simulator.state import (
     SPEED,
     START_X,
     TARGET_LANE,
+    TIME,
     VX,
     VY,
     X,
@@ -74,11 +75,11 @@ def _write_row(cars, tags, i, absolute, settings, row):
 
 
 @kernel
-def observe(cars, tags, settings, observation):
+def observe(cars, tags, world, settings, observation):
     """Write what the ego of one world sees into `observation`, float32 of shape (V, F).
 
     The ego's row comes first, in absolute numbers, then the nearest vehicles by distance along the road; rows of
-    vehicles that do not exist are zero.
+    vehicles that do not exist are zero. With a clock the ego's presence is 1 at first and 2 when the time is up.
     """
     room = settings.rows - 1
     seen = np.empty(room, np.int64)
@@ -102,6 +103,8 @@ def observe(cars, tags, settings, observation):
         seen[place] = j
         count = min(count + 1, room)
     _write_row(cars, tags, 0, True, settings, observation[0])
+    if settings.clock >= 0:
+        observation[0, settings.clock] += world[TIME] / settings.duration
     for k in range(count):
         _write_row(cars, tags, seen[k], settings.absolute, settings, observation[k + 1])
     observation[count + 1 :] = 0.0

@@ -35,20 +35,28 @@ class ReferenceHighwayEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     ``info["action"]`` is left out: at reset highway-env fills it with an unseeded sample.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], clock: int = -1) -> None:
+        """Wrap an environment; `clock` is the column of the ego's row that tells the time, -1 for none."""
         super().__init__(env)
-        self._start = 0.0
+        self._start, self._clock = 0.0, clock
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._start = float(self._ego.position[0])
-        return observation, self._info(info)
+        return self._timed(observation), self._info(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one decision."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, float(reward), bool(terminated), bool(truncated), self._info(info)
+        return self._timed(observation), float(reward), bool(terminated), bool(truncated), self._info(info)
+
+    def _timed(self, observation: Any) -> Any:
+        if self._clock >= 0:
+            highway: Any = self.env.unwrapped
+            # Added in double precision, as the compiled simulator does.
+            observation[0, self._clock] += np.float64(highway.time / highway.config["duration"])
+        return observation
 
     @property
     def _ego(self) -> Any:
@@ -123,13 +131,16 @@ def make_reference_env(
         import highway_env  # noqa: F401 - registers the ids  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
         raise RapidError("highway-env is not installed. Run: pip install highway-env") from error
+    merged = merge_config(chosen.config(), config)
+    observation = merged["observation"]
+    clock = observation["features"].index("presence") if observation.get("clock") else -1
     made = gymnasium.make(
         chosen.env_id,
         render_mode=render_mode,
-        config=merge_config(chosen.config(), config),
+        config=merged,
         disable_env_checker=True,  # it would step and reset once more, at highway-env's price
     )
-    return ReferenceHighwayEnv(made)
+    return ReferenceHighwayEnv(made, clock)
 
 
 def make_reference_vec(

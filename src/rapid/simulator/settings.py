@@ -64,6 +64,7 @@ FEATURES = (
 _OBSERVATION_KEYS = (
     *("type", "features", "vehicles_count", "features_range", "absolute", "order", "normalize", "clip", "see_behind"),
     *("observe_intentions", "include_obstacles"),
+    "clock",  # ours: highway-env takes it and does nothing
 )
 _ACTION_KEYS = ("type", "longitudinal", "lateral", "target_speeds")
 _DEFAULT_TARGET_SPEEDS = (20.0, 25.0, 30.0)
@@ -116,6 +117,8 @@ class Settings(NamedTuple):
     """Which features are mapped from [low, high] to [-1, 1]."""
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    clock: int
+    """The column to which, in the ego's row, the share of the time that has passed is added; -1 for none."""
 
 
 def merge_config(base: Mapping[str, Any], overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -248,6 +251,11 @@ def _read_observation(observation: Any, lanes: int) -> dict[str, Any]:
         if not isinstance(given, Mapping):
             raise RapidError(f"observation.features_range must map feature names to [low, high]; got {given!r}.")
         ranges = {name: _interval(pair, f"observation.features_range.{name}") for name, pair in given.items()}
+    clock = _flag(observation, "clock", False)
+    if clock and "presence" not in names:
+        raise RapidError(
+            "observation.clock adds the time to the ego's presence, which is not in observation.features. Add it."
+        )
     low, high = np.array([ranges.get(name, (-1.0, 1.0)) for name in names]).T
     return {
         # One row would mean no room for traffic; highway-env then returns more rows than its space says.
@@ -260,6 +268,7 @@ def _read_observation(observation: Any, lanes: int) -> dict[str, Any]:
         "scaled": np.array([name in ranges for name in names]),
         "low": np.ascontiguousarray(low),
         "high": np.ascontiguousarray(high),
+        "clock": names.index("presence") if clock else -1,
     }  # fmt: skip
 
 

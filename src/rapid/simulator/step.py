@@ -102,7 +102,7 @@ def reset_world(cars, tags, world, stream, settings, observation, info):
     spawn_world(cars, tags, world, stream, settings)
     reward(cars, tags, settings, info)
     describe(cars, tags, world, info)
-    observe(cars, tags, settings, observation)
+    observe(cars, tags, world, settings, observation)
 
 
 @kernel
@@ -121,7 +121,7 @@ def step_worlds(state, actions, settings, mode, out):
         if mode == FREEZE and (world[TERMINATED] != 0.0 or world[TRUNCATED] != 0.0):
             reward(cars, tags, settings, out.info[i])
             describe(cars, tags, world, out.info[i])
-            observe(cars, tags, settings, out.observations[i])
+            observe(cars, tags, world, settings, out.observations[i])
             out.rewards[i] = 0.0
             out.terminated[i] = world[TERMINATED] != 0.0
             out.truncated[i] = world[TRUNCATED] != 0.0
@@ -133,10 +133,10 @@ def step_worlds(state, actions, settings, mode, out):
         out.truncated[i] = truncated
         if mode == AUTORESET and (terminated or truncated):
             out.final_info[i] = out.info[i]
-            observe(cars, tags, settings, out.final_observations[i])
+            observe(cars, tags, world, settings, out.final_observations[i])
             reset_world(cars, tags, world, state.stream[i], settings, out.observations[i], out.info[i])
         else:
-            observe(cars, tags, settings, out.observations[i])
+            observe(cars, tags, world, settings, out.observations[i])
 
 
 @kernel
@@ -175,4 +175,4 @@ def forecast_worlds(state, actions, settings, observations, rewards, terminated,
         for t in range(actions.shape[1]):
             action = settings.actions[actions[i, t]]
             rewards[i, t], terminated[i, t], truncated[i, t] = step_world(cars, tags, world, action, settings, info)
-            observe(cars, tags, settings, observations[i, t])
+            observe(cars, tags, world, settings, observations[i, t])

@@ -11,6 +11,7 @@ from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
+from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.training.adam import flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
@@ -91,6 +92,7 @@ def adapt(
     rng = numpy_stream(seed, "adapt/exploration and batches")
     drive = Drive(make_worlds or _default_worlds(scenario), worlds_count, seed)
     explorer = Explorer(worlds_count, config.exploration_hold)
+    timed = get_scenario(scenario).clock
     steps = 0
 
     def state() -> dict[str, Any]:
@@ -116,7 +118,9 @@ def adapt(
     while steps < total_steps:
         epsilon = exploration(config, steps)
         action_W = explorer.act(network, drive.obs_WVF, epsilon, rng, device)
-        buffer.add(*drive.step(action_W))
+        *moved, terminated_W, truncated_W = drive.step(action_W)
+        # Who sees the clock is told that nothing comes after the time limit; to all others it is no end.
+        buffer.add(*moved, terminated_W | truncated_W if timed else terminated_W, truncated_W)
         steps += worlds_count
 
         due = int((steps - config.learning_starts) * config.updates_per_step)
