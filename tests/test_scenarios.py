@@ -20,6 +20,7 @@ def test_the_listed_scenarios_exist_under_their_own_names():
         density=st.integers(1, 2000).map(lambda hundredths: hundredths / 100),
         dynamics=st.sampled_from(["v0", "fast"]),
         reward=st.sampled_from(["normalized", "progress"]),
+        clock=st.booleans(),
     )
 )
 def test_any_scenario_is_read_back_from_its_name(scenario: Scenario):
@@ -31,6 +32,7 @@ def test_any_scenario_is_read_back_from_its_name(scenario: Scenario):
     [
         ("lane-3-densty-2", "did you mean 'lane-3-density-2'"),
         ("lane-3-density-2:speed", "did you mean"),
+        ("lane-3-density-2:clock:progress", "in this order"),
         ("", "Unknown scenario"),
         ("lane-0-density-2", "1 to 20 lanes"),
         ("lane-3-density-0", "density"),
@@ -49,3 +51,9 @@ def test_parking_earns_nothing_under_progress():
     assert config["reward_speed_range"][0] == 0
     assert not config["normalize_reward"]
     assert "normalize_reward" not in get_scenario("lane-3-density-2").config()
+
+
+def test_a_clock_changes_the_observation_alone():
+    timed, plain = (get_scenario(f"lane-3-density-2:progress{clock}").config() for clock in (":clock", ""))
+    assert timed["observation"].pop("clock")
+    assert timed == plain

@@ -1,7 +1,8 @@
 """Named driving scenarios, as data (paper: section 4.1 and the table "Highway Environment Configuration").
 
 A name reads ``lane-N-density-D[-fast][:progress][:clock]``: N lanes, traffic density D, the dynamics of ``highway-v0``
-or, with ``-fast``, of ``highway-fast-v0``, one of two rewards, and whether the observation tells the time. This module imports nothing heavy.
+or, with ``-fast``, of ``highway-fast-v0``, one of two rewards, and whether the observation tells the time. This module
+imports nothing heavy.
 """
 
 import re

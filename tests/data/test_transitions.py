@@ -67,6 +67,12 @@ def test_other_spaces_and_impossible_ends_are_refused():
         from_table(to_table(rows).drop_columns(["obs"]))
 
 
+def test_with_the_time_told_every_end_is_an_end():
+    rows = fake_transitions()
+    assert rows.truncated_N.any() and not rows.terminated_N[rows.truncated_N].any()
+    assert (rows.timed().terminated_N == rows.done_N).all()
+
+
 def test_concatenation_keeps_episodes_apart():
     both = concatenate([fake_transitions(3), fake_transitions(2, RANDOM), empty()]).validate()
     assert sorted(set(both.episode_N.tolist())) == [0, 1, 2, 3, 4]

@@ -110,6 +110,20 @@ def test_an_episode_is_cut_when_its_time_is_up() -> None:
     assert [step[2:4] for step in _drive(env, [1, 1, 1])] == [(False, False), (False, False), (False, True)]
 
 
+def test_a_clock_is_told_in_the_egos_presence_and_nowhere_else() -> None:
+    timed, theirs, plain = make_env(f"{FAST}:clock"), make_env(f"{FAST}:clock", "highway-env"), make_env(FAST)
+    envs = (timed, theirs, plain)
+    seen, expected, without = (env.reset(seed=3)[0] for env in envs)
+    for second in range(31):
+        assert seen[0, 0] == expected[0, 0] == np.float32(1 + second / 30)
+        seen[0, 0] = 1
+        assert (seen == without).all()
+        if second < 30:
+            (seen, *rest), (expected, *_), (without, *others) = (env.step(SLOWER) for env in envs)
+            assert _same(rest, others)
+    assert rest[2]  # the time is up
+
+
 @pytest.mark.parametrize("action", [5, -1, 1.0, "1", True, None, [1], np.array([1]), np.float32(1)])
 def test_a_wrong_action_is_refused_before_anything_moves(action: Any) -> None:
     env = CompiledHighwayEnv(FAST)

@@ -55,6 +55,7 @@ def test_every_listed_scenario_is_covered(name: str) -> None:
         ({"observation": {"type": "Kinematics", "features": ["x", "speed"]}}, "'speed'"),
         ({"observation": {"type": "Kinematics", "features": ["x", "x"]}}, "twice"),
         ({"observation": {"type": "Kinematics", "vehicles_count": 1}}, "observation.vehicles_count"),
+        ({"observation": {"type": "Kinematics", "features": ["x"], "clock": True}}, "observation.clock"),
         ({"observation": {"type": "Kinematics", "vehicle_count": 9}}, "observation.vehicle_count"),
         ({"observation": {"type": "Kinematics", "features_range": {"x": [1, 1]}}}, "features_range.x"),
         ({"action": {"type": "ContinuousAction"}}, "action.type"),

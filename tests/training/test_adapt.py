@@ -55,6 +55,25 @@ def test_training_twice_is_bit_equal(tmp_path, config):
     assert weights(train(tmp_path / "3", config, seed=4)) != weights(first)
 
 
+@pytest.mark.parametrize(("scenario", "ends"), [(SCENARIO, False), (f"{SCENARIO}:clock", True)])
+def test_the_time_limit_is_an_end_for_who_sees_the_clock(tmp_path, monkeypatch, scenario, ends):
+    added = []
+
+    class Watched(online.ReplayBuffer):
+        def add(self, *columns):
+            added.append([column.copy() for column in columns[-2:]])
+            super().add(*columns)
+
+    monkeypatch.setattr(online, "ReplayBuffer", Watched)
+    short = replace(CONFIG, evaluate_every=0)
+    adapt(network("rapid"), short, scenario, tmp_path, 3, make_worlds=lambda count: FakeWorlds(count, True, duration=4))
+    terminated, truncated = (np.concatenate(flags) for flags in zip(*added, strict=True))
+    assert truncated.any()
+    assert (terminated & truncated).any() == ends
+    assert not ends or terminated[truncated].all()
+    assert (terminated & ~truncated).any()  # crashes
+
+
 def test_offline_transitions_are_taken_over_one_step(tmp_path, monkeypatch):
     taken = []
 
