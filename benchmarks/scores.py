@@ -3,11 +3,12 @@
 For every scenario and seed: phase 2 on the mixture of the scenario's own data (RAPID; MLPs by DQN, double DQN, CQL;
 behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a double-DQN MLP from scratch that
 explores as RAPID does and, from 50,000 steps on, one with RAPID's loss as well; in the recipe `paper` also a DQN as
-printed), then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on
-the data of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call
-goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw
-rows) and `scores.md`; for the recipe `paper` `scores-paper`, with the paper's numbers beside ours. Of the floors and
-the planner it shows the rows in `floors.parquet`, which drove the same spawns.
+printed; with `--clock`, from 200,000 steps on, RAPID and that MLP once more where the observation tells the time),
+then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on the data of
+that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call goes on where
+it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw rows) and
+`scores.md`; for the recipe `paper` `scores-paper`, with the paper's numbers beside ours. Of the floors and the planner it
+shows the rows in `floors.parquet`, which drove the same spawns.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -18,7 +19,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -46,6 +47,10 @@ ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
 SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
+CLOCK_FROM = 200_000
+"""Least online steps of the agents that see the time."""
+CLOCK_DISCOUNT = 0.97
+"""Their discount: they know when the episode ends, so that none would be right in the end."""
 MLP_DISCOUNT = 0.93
 """Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
@@ -76,10 +81,24 @@ def offline_ablations(config: Config) -> dict[str, Config]:
     }
 
 
+class Trained(NamedTuple):
+    """An agent to be measured."""
+
+    name: str
+    directory: Path
+    scenario: str
+
+
 def train(
-    config: Config, data: str, work: Path, scenario: str, budgets: Iterable[int], ablations: bool
-) -> list[tuple[str, Path]]:
-    """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
+    config: Config,
+    data: str,
+    work: Path,
+    scenario: str,
+    budgets: Iterable[int],
+    ablations: bool = False,
+    clock: bool = False,
+) -> list[Trained]:
+    """Train what is missing and return the agents to be measured in a scenario.
 
     Args:
         config: the settings.
@@ -88,19 +107,20 @@ def train(
         scenario: where the agents adapt and are measured.
         budgets: online steps; each gives agents of its own.
         ablations: whether RAPID is trained without each of its parts as well.
+        clock: whether agents that see the time are trained as well.
     """
     mixture = work / "mix"
     if not (mixture / "dataset.json").exists():
         teacher, random = datasets(data, work.parent)
         work.mkdir(parents=True, exist_ok=True)
         pipeline.mix_datasets(config, teacher, random, mixture)
-    agents: list[tuple[str, Path]] = []
+    agents: list[Trained] = []
     offline_agents = offline_recipes(config) | (offline_ablations(config) if ablations else {})
     for name, settings in offline_agents.items():
         home = work / file_name(name)
         if not is_trained(home, settings, "distill"):
             pipeline.distill_agent(settings, mixture, home, name)
-        agents.append((name, home / "agent"))
+        agents.append(Trained(name, home / "agent", scenario))
     for steps in budgets:
         adapt = replace(adaptation(config.recipe, steps), scenario=scenario)
         discount = adapt.loss.discount if config.recipe == "paper" else min(adapt.loss.discount, MLP_DISCOUNT)
@@ -131,11 +151,16 @@ def train(
                 f"RAPID, {short(steps)}, fine-tuned whole": (replace(adapt, train="all"), work / "distilled", mixture),
                 f"RAPID, {short(steps)}, from scratch": (replace(adapt, train="scratch"), work / "distilled", mixture),
             }
+        if clock and steps >= CLOCK_FROM:
+            for name in (f"RAPID, {short(steps)}", f"online Munchausen DQN, {short(steps)}"):
+                settings, *start = online[name]
+                loss = replace(settings.loss, discount=CLOCK_DISCOUNT)
+                online[f"{name}, clock"] = (replace(settings, scenario=timed(scenario), loss=loss), *start)
         for name, (settings, origin, offline) in online.items():
             home, own = work / scenario / file_name(name), replace(config, adapt=settings)
             if not is_trained(home, own, "adapt"):
                 pipeline.adapt_agent(own, origin / "agent", offline, home, name)
-            agents.append((name, home / "agent"))
+            agents.append(Trained(name, home / "agent", settings.scenario))
     return agents
 
 
@@ -203,6 +228,11 @@ def datasets(scenario: str, work: Path) -> tuple[Path, Path]:
     return folders[0], folders[1]
 
 
+def timed(scenario: str) -> str:
+    """Return the scenario in which the same is seen, and the time."""
+    return replace(get_scenario(scenario), clock=True).name
+
+
 def short(steps: int) -> str:
     """Return a number of steps as it stands in an agent's name: 10K, 1M."""
     return f"{steps // 1000}K" if steps < 1_000_000 else f"{steps / 1_000_000:g}M"
@@ -213,9 +243,9 @@ def file_name(name: str) -> str:
     return name.replace(" ", "-").replace(",", "")
 
 
-def measure(config: Config, agents: Iterable[tuple[str, Path]], work: Path, scenario: str, spawns: int) -> None:
+def measure(config: Config, agents: Iterable[Trained], work: Path, spawns: int) -> None:
     """Drive every agent that has not been driven."""
-    for name, directory in agents:
+    for name, directory, scenario in agents:
         path = work / "rows" / f"{scenario}-{spawns}-{file_name(name)}.parquet"
         if path.exists() and path.stat().st_mtime > (directory / "config.json").stat().st_mtime:
             continue
@@ -268,6 +298,11 @@ def shown(number: Estimate, digits: int = 2) -> str:
 def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> str:
     """Return the tables as Markdown."""
     mlps = f"Online DDQN has no Munchausen term, and no MLP a discount above {MLP_DISCOUNT}. "
+    if any(get_scenario(row.scenario).clock for row in rows):
+        mlps += (
+            f"Agents with `clock` in their names see the time that has passed in the episode, at a discount of "
+            f"{CLOCK_DISCOUNT}. "
+        )
     if config.recipe == "paper":
         mlps = "Step, batch and target updates of the baselines as the paper prints them. "
     lines = [
@@ -281,6 +316,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         "",
         f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
     ]
+    # Whether the time is seen does not change the driving task; the agents' names tell.
+    rows = [replace(row, scenario=replace(get_scenario(row.scenario), clock=False).name) for row in rows]
     for scenario in dict.fromkeys(row.scenario for row in rows):
         here = [row for row in rows if row.scenario == scenario]
         clean = {
@@ -298,11 +335,12 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
                 (name, "slower"),
                 (name, teacher),
                 (name, "distilled"),
+                (name, name.removesuffix(", clock")),
                 (name, name.replace("RAPID", "online DDQN")),
                 (name, name.replace("RAPID", "online Munchausen DQN")),
             ]
         for name, other in pairs:
-            if other in clean and name in clean:
+            if other != name and other in clean and name in clean:
                 gain = difference(clean[name], clean[other])
                 crash = difference(clean[name], clean[other], "crashed")
                 lines.append(f"- {name} against {other}, paired: return {shown(gain)}, crash share {shown(crash, 3)}.")
@@ -340,8 +378,9 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     rows: list[EpisodeRow] = []
     own: list[EpisodeRow] = []
     for scenario in scenarios:
-        pattern = f"{data or scenario}/seed-*/rows/{scenario}-{spawns}-*.parquet"
-        paths = [work / "rows" / f"{scenario}-{spawns}-teacher.parquet", *sorted(work.glob(pattern))]
+        paths = [work / "rows" / f"{scenario}-{spawns}-teacher.parquet"]
+        for seen in (scenario, timed(scenario)):
+            paths += sorted(work.glob(f"{data or scenario}/seed-*/rows/{seen}-{spawns}-*.parquet"))
         here = [row for path in paths if path.exists() for row in load_rows(path)]
         own += here
         rows += [row for row in floors if row.scenario == scenario] + here
@@ -365,6 +404,7 @@ def main() -> None:
         "--steps", type=int, nargs="*", default=[10_000, 100_000, 300_000], help="online steps; may be none"
     )
     parser.add_argument("--ablations", action="store_true", help="train RAPID without each of its parts as well")
+    parser.add_argument("--clock", action="store_true", help="train agents that see the time as well")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")
     parser.add_argument("--out", type=Path, default=Path("results"), help="where the table goes")
@@ -382,8 +422,8 @@ def main() -> None:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
                 own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
-                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations)
-                measure(own, agents, home, scenario, chosen.spawns)
+                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations, chosen.clock)
+                measure(own, agents, home, chosen.spawns)
     table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)
 
 

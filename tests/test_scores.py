@@ -89,8 +89,25 @@ def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config
     assert discounts["online Munchausen DQN, 300K"] == discounts["online DDQN, 300K"] == benchmark.MLP_DISCOUNT
 
 
+def test_agents_that_see_the_time_adapt_and_drive_where_it_is_told(benchmark, config, tmp_path, asked):
+    agents = benchmark.train(config, "lane-3-density-2", tmp_path, "lane-3-density-2", (10_000, 300_000), clock=True)
+    told = {agent.name for agent in agents if agent.scenario == "lane-3-density-2:clock"}
+    assert (
+        told
+        == {name for name in asked if "clock" in name}
+        == {
+            "RAPID, 300K, clock",
+            "online Munchausen DQN, 300K, clock",
+        }
+    )
+    for name in told:
+        timed, untold = (asked[each][0] for each in (name, name.removesuffix(", clock")))
+        loss = replace(untold.loss, discount=benchmark.CLOCK_DISCOUNT)
+        assert timed == replace(untold, scenario="lane-3-density-2:clock", loss=loss)
+
+
 def test_the_recipe_paper_has_its_online_dqn_as_printed(benchmark, tmp_path, asked):
-    benchmark.train(preset("paper", "full"), "lane-3-density-2", tmp_path, "lane-3-density-2", (10_000,), False)
+    benchmark.train(preset("paper", "full"), "lane-3-density-2", tmp_path, "lane-3-density-2", (10_000,))
     assert list(asked) == ["RAPID, 10K", "online DDQN, 10K", "online DQN, 10K"]
     rates = {name: (adapt.optimizer.learning_rate, adapt.loss.double) for name, (adapt, *_) in asked.items()}
     assert rates["online DQN, 10K"] == (5e-3, False)

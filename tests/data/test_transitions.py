@@ -69,7 +69,8 @@ def test_other_spaces_and_impossible_ends_are_refused():
 
 def test_with_the_time_told_every_end_is_an_end():
     rows = fake_transitions()
-    assert rows.truncated_N.any() and not rows.terminated_N[rows.truncated_N].any()
+    assert rows.truncated_N.any()
+    assert not rows.terminated_N[rows.truncated_N].any()
     assert (rows.timed().terminated_N == rows.done_N).all()
 
 
