@@ -4,11 +4,11 @@ For every scenario and seed: phase 2 on the mixture of the scenario's own data (
 behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a double-DQN MLP from scratch that
 explores as RAPID does and, from 50,000 steps on, one with RAPID's loss as well; in the recipe `paper` also a DQN as
 printed; with `--clock`, from 200,000 steps on, RAPID and that MLP once more where the observation tells the time),
-then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on the data of
-that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call goes on where
-it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw rows) and
-`scores.md`; for the recipe `paper` `scores-paper`, with the paper's numbers beside ours. Of the floors and the planner it
-shows the rows in `floors.parquet`, which drove the same spawns.
+then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on the data
+of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call goes on
+where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw rows)
+and `scores.md`; for the recipe `paper` `scores-paper`, with the paper's numbers beside ours. Of the floors and the
+planner it shows the rows in `floors.parquet`, which drove the same spawns.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table

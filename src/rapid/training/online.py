@@ -118,9 +118,10 @@ def adapt(
     while steps < total_steps:
         epsilon = exploration(config, steps)
         action_W = explorer.act(network, drive.obs_WVF, epsilon, rng, device)
-        *moved, terminated_W, truncated_W = drive.step(action_W)
+        obs_WVF, action_W, reward_W, next_obs_WVF, terminated_W, truncated_W = drive.step(action_W)
         # Who sees the clock is told that nothing comes after the time limit; to all others it is no end.
-        buffer.add(*moved, terminated_W | truncated_W if timed else terminated_W, truncated_W)
+        ended_W = terminated_W | truncated_W if timed else terminated_W
+        buffer.add(obs_WVF, action_W, reward_W, next_obs_WVF, ended_W, truncated_W)
         steps += worlds_count
 
         due = int((steps - config.learning_starts) * config.updates_per_step)
