@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from rapid import pipeline
-from rapid.config import AdaptConfig, Config, TeacherConfig, apply_overrides, preset, to_dict
+from rapid.config import AdaptConfig, Config, TeacherConfig, preset
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder
@@ -40,6 +40,7 @@ from rapid.progress import task
 from rapid.report.data import paper_return
 from rapid.runs import commit
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
+from rapid.settings import apply_overrides, to_dict
 from rapid.spawns import spawn_seeds
 from rapid.teacher import make_teacher
 

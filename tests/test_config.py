@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rapid import config as settings
-from rapid.config import Config, apply_overrides, load_toml, preset, to_dict, to_toml, validate
+from rapid.config import Config, preset
 from rapid.errors import RapidError
+from rapid.settings import apply_overrides, load_toml, to_dict, to_toml, validate
 
 PRESETS = [(recipe, scale) for recipe in settings.RECIPES for scale in settings.SCALES]
 

@@ -13,9 +13,10 @@ import pytest
 
 import rapid
 from rapid import pipeline
-from rapid.config import Config, apply_overrides, preset
+from rapid.config import Config, preset
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
+from rapid.settings import apply_overrides
 
 SMALL = {
     "teacher": {"backend": "scripted", "model": "rule"},

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from rapid.config import apply_overrides, load_toml, preset
+from rapid.config import preset
 from rapid.errors import RapidError
 from rapid.files import read_json
 from rapid.runs import RunDirectory
+from rapid.settings import apply_overrides, load_toml
 
 STEPS = ("collect", "mix", "distill")
 

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rapid.config import preset, to_dict
+from rapid.config import preset
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.agent import save_agent
 from rapid.networks.q_network import build_network
+from rapid.settings import to_dict
 from rapid.teacher.scripted import Scripted
 
 SCRIPTED = Scripted("slower", 3, 0)

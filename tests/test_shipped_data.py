@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rapid import pipeline
-from rapid.config import Config, TeacherConfig, apply_overrides, preset
+from rapid.config import Config, TeacherConfig, preset
 from rapid.data.card import card
 from rapid.data.dataset import load_dataset
 from rapid.data.shipped import dataset_folder, shipped_sets
@@ -17,6 +17,7 @@ from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.teachers import drive_teacher
 from rapid.files import read_json
 from rapid.scenarios import PAPER_SCENARIOS
+from rapid.settings import apply_overrides
 from rapid.teacher import make_teacher
 from rapid.verbs import call
 

@@ -10,7 +10,15 @@ import pytest
 
 from fake_worlds import fake_transitions
 from rapid import tracking
-from rapid.config import Config, DistillConfig, LossConfig, NetworkConfig, OptimizerConfig, preset, without_place
+from rapid.config import (
+    Config,
+    DistillConfig,
+    LossConfig,
+    NetworkConfig,
+    OptimizerConfig,
+    preset,
+    without_place,
+)
 from rapid.errors import RapidError
 from rapid.networks.q_network import build_network
 from rapid.tracking import Tracker, check_tracking, numbers_of

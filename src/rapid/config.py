@@ -3,22 +3,15 @@
 A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
 ``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
 ``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps).
-Precedence, low to high: recipe and scale, ``--config FILE.toml``, options. This module imports nothing heavy.
+Precedence, low to high: recipe and scale, ``--config FILE.toml``, options (:mod:`rapid.settings`). This module imports
+nothing heavy.
 """
 
-import dataclasses
-import json
-import math
-import os
-import tomllib
-import types
 import typing
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 from rapid.errors import RapidError, did_you_mean
-from rapid.scenarios import get_scenario
 
 Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full", "long"]
@@ -27,8 +20,6 @@ SCALES: tuple[str, ...] = typing.get_args(Scale)
 
 LONG_STEPS = 300_000
 """Online steps of the scale `long`."""
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -465,216 +456,3 @@ def _at_length(adapt: AdaptConfig) -> AdaptConfig:
 def without_place(config: Config) -> Config:
     """Return `config` with the settings at their defaults that say where and how fast it is computed, not what."""
     return replace(config, threads=1, tracking="none", collect=replace(config.collect, engine="local", workers=1))
-
-
-def to_dict(config: Any) -> dict[str, Any]:
-    """Return a dataclass as plain dictionaries and lists, ready for JSON or TOML."""
-    return dataclasses.asdict(config)
-
-
-def apply_overrides(config: T, overrides: dict[str, Any], where: str = "", source: str = "the settings") -> T:
-    """Return `config` with nested `overrides` applied, every key and type checked.
-
-    Raises:
-        RapidError: a key that does not exist, or a value of the wrong type; the message names the key and `source`.
-    """
-    hints = typing.get_type_hints(type(config))
-    changes: dict[str, Any] = {}
-    for key, value in overrides.items():
-        path = f"{where}.{key}" if where else key
-        if key not in hints:
-            raise RapidError(
-                f"Unknown setting '{path}' in {source}{did_you_mean(key, hints)} Known here: {', '.join(hints)}."
-            )
-        current = getattr(config, key)
-        if dataclasses.is_dataclass(current):
-            if not isinstance(value, dict):
-                raise RapidError(f"Setting '{path}' in {source} must be a table, not {value!r}.")
-            changes[key] = apply_overrides(current, value, path, source)
-        else:
-            changes[key] = _checked(value, hints[key], path, source)
-    return dataclasses.replace(config, **changes)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
-
-
-def _checked(value: Any, hint: Any, path: str, source: str) -> Any:
-    """Return `value` if it has the type `hint`, with integers widened to floats and lists turned into tuples."""
-    origin = typing.get_origin(hint)
-    if isinstance(hint, types.GenericAlias) and origin is tuple:
-        if isinstance(value, list | tuple):
-            return tuple(_checked(item, typing.get_args(hint)[0], path, source) for item in value)
-        expected = "a list"
-    elif origin is Literal:
-        choices = typing.get_args(hint)
-        if value in choices:
-            return value
-        hint_text = did_you_mean(value, choices) if isinstance(value, str) else "."
-        raise RapidError(
-            f"Setting '{path}' in {source} is {value!r}{hint_text} Choose one of {', '.join(map(str, choices))}."
-        )
-    elif hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    elif type(value) is hint:
-        return value
-    else:
-        expected = f"of type {hint.__name__}"
-    raise RapidError(f"Setting '{path}' in {source} must be {expected}, not {value!r}.")
-
-
-def _refuse_non_finite(values: dict[str, Any], where: str = "") -> None:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            _refuse_non_finite(value, f"{where}{key}.")
-        elif isinstance(value, float) and not math.isfinite(value):
-            raise RapidError(f"Setting '{where}{key}' is {value}, but must be a finite number.")
-
-
-def load_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file of settings.
-
-    Raises:
-        RapidError: the file is missing, unreadable or not TOML.
-    """
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise RapidError(f"Cannot read the settings file '{path}': {error}. Give the path of a TOML file.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise RapidError(f"The settings file '{path}' is not valid TOML: {error}. Correct that line.") from error
-
-
-def validate(config: Config) -> Config:
-    """Return `config` if its numbers make sense together.
-
-    Raises:
-        RapidError: the first setting that does not, with what was expected.
-    """
-    _refuse_non_finite(to_dict(config))
-    get_scenario(config.scenario)
-    if config.adapt.scenario:
-        get_scenario(config.adapt.scenario)
-    network, collect, evaluate = config.network, config.collect, config.evaluate
-    losses = {"distill": config.distill, "adapt": config.adapt}
-    checks: list[tuple[bool, str, Any, str]] = [
-        (0 <= config.seed < 2**32, "seed", config.seed, "between 0 and 2^32 - 1"),
-        (config.threads >= 1, "threads", config.threads, "at least 1"),
-        (collect.teacher_transitions >= 0, "collect.teacher_transitions", collect.teacher_transitions, "at least 0"),
-        (collect.random_transitions >= 0, "collect.random_transitions", collect.random_transitions, "at least 0"),
-        (collect.lockstep >= 1, "collect.lockstep", collect.lockstep, "at least 1"),
-        (collect.max_decisions >= 0, "collect.max_decisions", collect.max_decisions, "at least 0"),
-        (1 <= collect.workers <= 1000, "collect.workers", collect.workers, "between 1 and 1000"),
-        (0 <= collect.shards <= 1000, "collect.shards", collect.shards, "between 0 and 1000"),
-        (
-            collect.shard == "1/1" or max(collect.workers, collect.shards) == 1,
-            "collect.shard",
-            collect.shard,
-            "1/1 where collect.workers or collect.shards divide the collection",
-        ),
-        (
-            collect.engine == "local" or max(collect.workers, collect.shards) > 1,
-            "collect.workers",
-            collect.workers,
-            f"at least 2 for the engine '{collect.engine}'",
-        ),
-        (0 <= config.mix.p <= 1, "mix.p", config.mix.p, "between 0 and 1"),
-        (config.mix.size >= 1, "mix.size", config.mix.size, "at least 1"),
-        (network.num_policies >= 1, "network.num_policies", network.num_policies, "at least 1"),
-        (
-            1 <= network.top_k <= network.num_policies,
-            "network.top_k",
-            network.top_k,
-            f"between 1 and network.num_policies = {network.num_policies}",
-        ),
-        (network.layers >= 1, "network.layers", network.layers, "at least 1"),
-        (network.decoder_layers >= 1, "network.decoder_layers", network.decoder_layers, "at least 1"),
-        (
-            network.heads >= 1 and network.width % network.heads == 0,
-            "network.width",
-            network.width,
-            f"a multiple of network.heads = {network.heads}",
-        ),
-        (config.adapt.num_envs >= 1, "adapt.num_envs", config.adapt.num_envs, "at least 1"),
-        (config.adapt.updates_per_step > 0, "adapt.updates_per_step", config.adapt.updates_per_step, "above 0"),
-        (0 <= config.adapt.offline_share < 1, "adapt.offline_share", config.adapt.offline_share, "in [0, 1)"),
-        (network.width >= 1, "network.width", network.width, "at least 1"),
-        (network.feedforward >= 1, "network.feedforward", network.feedforward, "at least 1"),
-        (config.distill.iterations >= 1, "distill.iterations", config.distill.iterations, "at least 1"),
-        (config.distill.evaluate_every >= 0, "distill.evaluate_every", config.distill.evaluate_every, "at least 0"),
-        (config.adapt.steps >= 1, "adapt.steps", config.adapt.steps, "at least 1"),
-        (config.adapt.evaluate_every >= 0, "adapt.evaluate_every", config.adapt.evaluate_every, "at least 0"),
-        (config.adapt.buffer_size >= 1, "adapt.buffer_size", config.adapt.buffer_size, "at least 1"),
-        *(
-            (0 <= value <= 1, f"adapt.exploration_{name}", value, "between 0 and 1")
-            for name, value in (
-                ("start", config.adapt.exploration_start),
-                ("end", config.adapt.exploration_end),
-                ("share", config.adapt.exploration_share),
-            )
-        ),
-        (config.adapt.exploration_hold >= 1, "adapt.exploration_hold", config.adapt.exploration_hold, "at least 1"),
-        (config.adapt.learning_starts >= 0, "adapt.learning_starts", config.adapt.learning_starts, "at least 0"),
-        (config.teacher.concurrency >= 1, "teacher.concurrency", config.teacher.concurrency, "at least 1"),
-        (config.teacher.max_turns >= 1, "teacher.max_turns", config.teacher.max_turns, "at least 1"),
-        (config.teacher.few_shot >= 0, "teacher.few_shot", config.teacher.few_shot, "at least 0"),
-        (evaluate.spawns >= 1, "evaluate.spawns", evaluate.spawns, "at least 1"),
-        (evaluate.teacher_spawns >= 0, "evaluate.teacher_spawns", evaluate.teacher_spawns, "at least 0"),
-        (evaluate.planner_spawns >= 0, "evaluate.planner_spawns", evaluate.planner_spawns, "at least 0"),
-        (evaluate.curve_spawns >= 0, "evaluate.curve_spawns", evaluate.curve_spawns, "at least 0"),
-        (len(evaluate.attacks) >= 1, "evaluate.attacks", evaluate.attacks, "at least one name, such as none"),
-    ]
-    for name, phase in losses.items():
-        loss, optimizer = phase.loss, phase.optimizer
-        checks += [
-            (0 <= loss.discount <= 1, f"{name}.loss.discount", loss.discount, "between 0 and 1"),
-            (loss.n_step >= 1, f"{name}.loss.n_step", loss.n_step, "at least 1"),
-            (
-                0 <= loss.munchausen_weight < 1,
-                f"{name}.loss.munchausen_weight",
-                loss.munchausen_weight,
-                "in [0, 1)",
-            ),
-            (
-                loss.munchausen_temperature > 0,
-                f"{name}.loss.munchausen_temperature",
-                loss.munchausen_temperature,
-                "above 0",
-            ),
-            (loss.temperature > 0, f"{name}.loss.temperature", loss.temperature, "above 0"),
-            (loss.robust.radius >= 0, f"{name}.loss.robust.radius", loss.robust.radius, "at least 0"),
-            (loss.robust.steps >= 1, f"{name}.loss.robust.steps", loss.robust.steps, "at least 1"),
-            (optimizer.learning_rate > 0, f"{name}.optimizer.learning_rate", optimizer.learning_rate, "above 0"),
-            (optimizer.gate_rate > 0, f"{name}.optimizer.gate_rate", optimizer.gate_rate, "above 0"),
-            (optimizer.batch_size >= 1, f"{name}.optimizer.batch_size", optimizer.batch_size, "at least 1"),
-            (optimizer.target_update >= 1, f"{name}.optimizer.target_update", optimizer.target_update, "at least 1"),
-            (0 < optimizer.target_rate <= 1, f"{name}.optimizer.target_rate", optimizer.target_rate, "in (0, 1]"),
-        ]
-    for good, setting, value, expected in checks:
-        if not good:
-            raise RapidError(f"Setting '{setting}' is {value}, but must be {expected}.")
-    return config
-
-
-def to_toml(settings: dict[str, Any]) -> str:
-    """Return nested settings as TOML; :func:`load_toml` reads the same values back."""
-    lines: list[str] = []
-
-    def table(values: dict[str, Any], path: str) -> None:
-        if path:
-            lines.extend(("", f"[{path}]"))
-        lines.extend(f"{key} = {_toml_value(value)}" for key, value in values.items() if not isinstance(value, dict))
-        for key, value in values.items():
-            if isinstance(value, dict):
-                table(value, f"{path}.{key}" if path else key)
-
-    table(settings, "")
-    return "\n".join(lines).lstrip("\n") + "\n"
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str):
-        # TOML's basic strings escape as JSON's do, except for DEL.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return f"[{', '.join(map(_toml_value, value))}]"

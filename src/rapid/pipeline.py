@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 
 from rapid.attacks import get_attack
-from rapid.config import Config, TeacherConfig, apply_overrides, preset, to_dict, validate, without_place
+from rapid.config import Config, TeacherConfig, preset, without_place
 from rapid.data.collection import Budget, collect, parse_shard
 from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
 from rapid.data.journal import exclusive
@@ -37,6 +37,7 @@ from rapid.reproduce import paper_numbers
 from rapid.runs import RunDirectory, commit
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
+from rapid.settings import apply_overrides, to_dict, validate
 from rapid.simulator import make_vec
 from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import Teacher, check_teacher, make_teacher

@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import rapid
-from rapid.config import Config, apply_overrides, preset, to_dict, to_toml, without_place
+from rapid.config import Config, preset, without_place
 from rapid.errors import RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
+from rapid.settings import apply_overrides, to_dict, to_toml
 
 FORMAT = 1
 _PACKAGES = (

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from rapid.config import Config, TeacherConfig, apply_overrides, load_toml, preset, to_dict, validate
+from rapid.config import Config, TeacherConfig, preset
 from rapid.data.journal import exclusive
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.agents import open_agent
@@ -31,6 +31,7 @@ from rapid.progress import task
 from rapid.report.figures import save_figure, teachers_figure
 from rapid.runs import commit, versions
 from rapid.scenarios import get_scenario
+from rapid.settings import apply_overrides, load_toml, to_dict, validate
 from rapid.simulator import make_vec
 from rapid.spawns import SpawnSet, spawn_seeds
 from rapid.teacher import make_teacher, models

@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from tyro.conf import Positional, arg
 
-from rapid import config as settings
 from rapid.config import (
+    RECIPES,
+    SCALES,
     AdaptConfig,
     CollectConfig,
     Config,
@@ -24,9 +25,12 @@ from rapid.config import (
     Recipe,
     Scale,
     TeacherConfig,
+    preset,
+    without_place,
 )
 from rapid.errors import RapidError
 from rapid.scenarios import PAPER_SCENARIOS, Reward, get_scenario
+from rapid.settings import apply_overrides, load_toml, to_dict, validate
 from rapid.tracking import Tracking
 
 T = TypeVar("T")
@@ -276,18 +280,18 @@ def call(verb: str, words: Sequence[str]) -> int:
 def _base_settings(words: Sequence[str]) -> Config:
     """The settings that recipe, scale and a settings file give, before the options."""
     chosen = {name: _option(words, name) for name in ("recipe", "scale", "config")}
-    overrides = settings.load_toml(chosen["config"]) if chosen["config"] else {}
+    overrides = load_toml(chosen["config"]) if chosen["config"] else {}
     source = f"'{chosen['config']}'"
     recipe = chosen["recipe"] or str(overrides.get("recipe", Config.recipe))
     scale = chosen["scale"] or str(overrides.get("scale", Config.scale))
     if words and ("-h" in words or "--help" in words):
         recipe, scale = (
-            (recipe if recipe in settings.RECIPES else "strong"),
-            (scale if scale in settings.SCALES else "quick"),
+            (recipe if recipe in RECIPES else "strong"),
+            (scale if scale in SCALES else "quick"),
         )
-    base = settings.preset(recipe, scale)
+    base = preset(recipe, scale)
     overrides = {key: value for key, value in overrides.items() if key not in ("recipe", "scale")}
-    return settings.apply_overrides(base, overrides, source=source)
+    return apply_overrides(base, overrides, source=source)
 
 
 def _option(words: Sequence[str], name: str) -> str:
@@ -320,25 +324,23 @@ def _defaults(kind: type[T], base: Config) -> T:
 def _with_options(base: Config, options: Any) -> Config:
     """`base` with the sections and values that a verb's options carry."""
     if isinstance(options, Run):
-        return settings.validate(options.settings)
+        return validate(options.settings)
     names = {item.name for item in dataclasses.fields(options)} & {item.name for item in dataclasses.fields(Config)}
     config = dataclasses.replace(base, **{name: getattr(options, name) for name in names})
     curve_spawns = getattr(options, "curve_spawns", None)
     if curve_spawns is not None:
         config = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, curve_spawns=curve_spawns))
-    return settings.validate(config)
+    return validate(config)
 
 
 def _run(options: Run, config: Config) -> int:
     from rapid import pipeline
 
     name = f"{config.scenario}-{config.recipe}-{config.scale}-seed{config.seed}".replace(":", "-")
-    plain = dataclasses.replace(
-        settings.preset(config.recipe, config.scale), scenario=config.scenario, seed=config.seed
-    )
-    if settings.without_place(config) != settings.without_place(plain):
+    plain = dataclasses.replace(preset(config.recipe, config.scale), scenario=config.scenario, seed=config.seed)
+    if without_place(config) != without_place(plain):
         # Any other setting gets a directory of its own, so that it does not meet the run without it.
-        differing = json.dumps(settings.to_dict(settings.without_place(config)), sort_keys=True)
+        differing = json.dumps(to_dict(without_place(config)), sort_keys=True)
         name += f"-{hashlib.sha256(differing.encode()).hexdigest()[:8]}"
     pipeline.run(config, Path(options.directory or f"runs/{name}"), options.restart)
     return 0

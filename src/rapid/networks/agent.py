@@ -12,11 +12,12 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from rapid import files
-from rapid.config import NetworkConfig, apply_overrides
+from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
 from rapid.networks.q_network import Explanation, QNetwork, build_network
 from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
+from rapid.settings import apply_overrides
 
 FORMAT = "rapid-agent"
 VERSION = 1

@@ -47,7 +47,7 @@ class ReportData:
     title: str
     """What to call the run."""
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """The resolved settings, as :func:`rapid.config.to_dict` gives them."""
+    """The resolved settings, as :func:`rapid.settings.to_dict` gives them."""
     versions: Mapping[str, str] = field(default_factory=dict[str, str])
     """Versions of what computed it."""
     commit: str = ""

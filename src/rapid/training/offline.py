@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from rapid.config import DistillConfig, LossConfig, to_dict
+from rapid.config import DistillConfig, LossConfig
 from rapid.data.replay import OfflineSampler
 from rapid.data.transitions import TEACHER, Transitions
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, set_phase
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, torch_stream
+from rapid.settings import to_dict
 from rapid.training.adam import flush_denormals
 from rapid.training.learner import Learner
 from rapid.training.record import Evaluate, Record, Track, crossed, fingerprint, network_fingerprint

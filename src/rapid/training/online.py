@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from rapid.config import AdaptConfig, to_dict
+from rapid.config import AdaptConfig
 from rapid.data.replay import OfflineSampler, ReplayBuffer, join_batches
 from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
@@ -13,6 +13,7 @@ from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
+from rapid.settings import to_dict
 from rapid.training.adam import flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import Learner
