@@ -3,12 +3,12 @@
 For every scenario and seed: phase 2 on the mixture of the scenario's own data (RAPID; MLPs by DQN, double DQN, CQL;
 behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a double-DQN MLP from scratch that
 explores as RAPID does and, from 50,000 steps on, one with RAPID's loss as well; in the recipe `paper` also a DQN as
-printed; with `--clock`, from 200,000 steps on, RAPID and that MLP once more where the observation tells the time),
-then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on the data
-of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call goes on
-where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw rows)
-and `scores.md`; for the recipe `paper` `scores-paper`, with the paper's numbers beside ours. Of the floors and the
-planner it shows the rows in `floors.parquet`, which drove the same spawns.
+printed), then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on
+the data of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted
+call goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there:
+`scores.parquet` (raw rows) and `scores.md`; `scores-paper` for the recipe `paper`, with the paper's numbers beside
+ours, and `scores-progress` for the reward `progress`. Of the floors and the planner it shows the rows in
+`floors.parquet`, which drove the same spawns.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -16,7 +16,7 @@ planner it shows the rows in `floors.parquet`, which drove the same spawns.
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -48,10 +48,6 @@ ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 FLOORS = ("slower", "rule", "planner")
 SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
-CLOCK_FROM = 200_000
-"""Least online steps of the agents that see the time."""
-CLOCK_DISCOUNT = 0.97
-"""Their discount: they know when the episode ends, so that none would be right in the end."""
 MLP_DISCOUNT = 0.93
 """Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
@@ -82,12 +78,46 @@ def offline_ablations(config: Config) -> dict[str, Config]:
     }
 
 
-class Trained(NamedTuple):
-    """An agent to be measured."""
+class Adaptation(NamedTuple):
+    """How an agent is trained online."""
 
-    name: str
-    directory: Path
-    scenario: str
+    settings: AdaptConfig
+    origin: str
+    """The agent trained offline that it starts from or, from scratch, whose network it has."""
+    with_data: bool
+
+
+def online_recipes(config: Config, scenario: str, steps: int, ablations: bool) -> dict[str, Adaptation]:
+    """Return how every agent is trained in a scenario for a number of online steps, by name."""
+    adapt = replace(adaptation(config.recipe, steps), scenario=scenario)
+    discount = adapt.loss.discount if config.recipe == "paper" else min(adapt.loss.discount, MLP_DISCOUNT)
+    from_scratch = replace(
+        adapt,
+        train="scratch",
+        exploration_start=1.0,
+        exploration_end=0.05,
+        offline_share=0.0,
+        loss=replace(adapt.loss, conservative_weight=0.0, double=True, munchausen_weight=0.0, discount=discount),
+        optimizer=replace(adapt.optimizer, learning_rate=5e-4),
+    )
+    found = {
+        f"RAPID, {short(steps)}": Adaptation(adapt, "distilled", with_data=True),
+        f"online DDQN, {short(steps)}": Adaptation(from_scratch, "offline DDQN", with_data=False),
+    }
+    if adapt.loss.munchausen_weight:
+        # The same as RAPID but for the network, where it starts, and that nothing of it is frozen.
+        same = replace(from_scratch, loss=replace(adapt.loss, discount=discount))
+        found[f"online Munchausen DQN, {short(steps)}"] = Adaptation(same, "offline DDQN", with_data=False)
+    if config.recipe == "paper":
+        rate = pipeline.baseline(config, "dqn").distill.optimizer.learning_rate
+        plain = replace(from_scratch.loss, double=False)
+        dqn = replace(from_scratch, loss=plain, optimizer=replace(from_scratch.optimizer, learning_rate=rate))
+        found[f"online DQN, {short(steps)}"] = Adaptation(dqn, "offline DQN", with_data=False)
+    if ablations:
+        for what, weights in (("fine-tuned whole", "all"), ("from scratch", "scratch")):
+            other = replace(adapt, train=weights)
+            found[f"RAPID, {short(steps)}, {what}"] = Adaptation(other, "distilled", with_data=True)
+    return found
 
 
 def train(
@@ -97,9 +127,9 @@ def train(
     scenario: str,
     budgets: Iterable[int],
     ablations: bool = False,
-    clock: bool = False,
-) -> list[Trained]:
-    """Train what is missing and return the agents to be measured in a scenario.
+    only: Sequence[str] = (),
+) -> list[tuple[str, Path]]:
+    """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
 
     Args:
         config: the settings.
@@ -108,60 +138,41 @@ def train(
         scenario: where the agents adapt and are measured.
         budgets: online steps; each gives agents of its own.
         ablations: whether RAPID is trained without each of its parts as well.
-        clock: whether agents that see the time are trained as well.
+        only: names of the agents wanted; none are all of them.
+
+    Raises:
+        RapidError: an agent of `only` does not exist, or one was trained with other settings.
     """
+    offline = offline_recipes(config) | (offline_ablations(config) if ablations else {})
+    online: dict[str, Adaptation] = {}
+    for steps in budgets:
+        online |= online_recipes(config, scenario, steps, ablations)
+    wanted = list(only) or [*offline, *online]
+    for name in wanted:
+        if name not in offline and name not in online:
+            names = ", ".join(f"'{name}'" for name in (*offline, *online))
+            raise RapidError(f"There is no agent '{name}' among {names}. Choose others, or other --steps.")
     mixture = work / "mix"
     if not (mixture / "dataset.json").exists():
         teacher, random = datasets(data, work.parent)
         work.mkdir(parents=True, exist_ok=True)
         pipeline.mix_datasets(config, teacher, random, mixture)
-    agents: list[Trained] = []
-    offline_agents = offline_recipes(config) | (offline_ablations(config) if ablations else {})
-    for name, settings in offline_agents.items():
+    agents: list[tuple[str, Path]] = []
+    origins = {online[name].origin for name in wanted if name in online}
+    for name, settings in offline.items():
         home = work / file_name(name)
-        if not is_trained(home, settings, "distill"):
-            pipeline.distill_agent(settings, mixture, home, name)
-        agents.append(Trained(name, home / "agent", scenario))
-    for steps in budgets:
-        adapt = replace(adaptation(config.recipe, steps), scenario=scenario)
-        discount = adapt.loss.discount if config.recipe == "paper" else min(adapt.loss.discount, MLP_DISCOUNT)
-        from_scratch = replace(
-            adapt,
-            train="scratch",
-            exploration_start=1.0,
-            exploration_end=0.05,
-            offline_share=0.0,
-            loss=replace(adapt.loss, conservative_weight=0.0, double=True, munchausen_weight=0.0, discount=discount),
-            optimizer=replace(adapt.optimizer, learning_rate=5e-4),
-        )
-        online = {
-            f"RAPID, {short(steps)}": (adapt, work / "distilled", mixture),
-            f"online DDQN, {short(steps)}": (from_scratch, work / "offline-DDQN", None),
-        }
-        if adapt.loss.munchausen_weight:
-            # The same as RAPID but for the network, where it starts, and that nothing of it is frozen.
-            same = replace(from_scratch, loss=replace(adapt.loss, discount=discount))
-            online[f"online Munchausen DQN, {short(steps)}"] = (same, work / "offline-DDQN", None)
-        if config.recipe == "paper":
-            rate = pipeline.baseline(config, "dqn").distill.optimizer.learning_rate
-            plain = replace(from_scratch.loss, double=False)
-            dqn = replace(from_scratch, loss=plain, optimizer=replace(from_scratch.optimizer, learning_rate=rate))
-            online[f"online DQN, {short(steps)}"] = (dqn, work / "offline-DQN", None)
-        if ablations:
-            online |= {
-                f"RAPID, {short(steps)}, fine-tuned whole": (replace(adapt, train="all"), work / "distilled", mixture),
-                f"RAPID, {short(steps)}, from scratch": (replace(adapt, train="scratch"), work / "distilled", mixture),
-            }
-        if clock and steps >= CLOCK_FROM:
-            for name in (f"RAPID, {short(steps)}", f"online Munchausen DQN, {short(steps)}"):
-                settings, *start = online[name]
-                loss = replace(settings.loss, discount=CLOCK_DISCOUNT)
-                online[f"{name}, clock"] = (replace(settings, scenario=timed(scenario), loss=loss), *start)
-        for name, (settings, origin, offline) in online.items():
-            home, own = work / scenario / file_name(name), replace(config, adapt=settings)
+        if name in wanted or name in origins:
+            if not is_trained(home, settings, "distill"):
+                pipeline.distill_agent(settings, mixture, home, name)
+            if name in wanted:
+                agents.append((name, home / "agent"))
+    for name, (settings, origin, with_data) in online.items():
+        home, own = work / scenario / file_name(name), replace(config, adapt=settings)
+        if name in wanted:
             if not is_trained(home, own, "adapt"):
-                pipeline.adapt_agent(own, origin / "agent", offline, home, name)
-            agents.append(Trained(name, home / "agent", settings.scenario))
+                start = work / file_name(origin) / "agent"
+                pipeline.adapt_agent(own, start, mixture if with_data else None, home, name)
+            agents.append((name, home / "agent"))
     return agents
 
 
@@ -229,11 +240,6 @@ def datasets(scenario: str, work: Path) -> tuple[Path, Path]:
     return folders[0], folders[1]
 
 
-def timed(scenario: str) -> str:
-    """Return the scenario in which the same is seen, and the time."""
-    return replace(get_scenario(scenario), clock=True).name
-
-
 def short(steps: int) -> str:
     """Return a number of steps as it stands in an agent's name: 10K, 1M."""
     return f"{steps // 1000}K" if steps < 1_000_000 else f"{steps / 1_000_000:g}M"
@@ -244,9 +250,9 @@ def file_name(name: str) -> str:
     return name.replace(" ", "-").replace(",", "")
 
 
-def measure(config: Config, agents: Iterable[Trained], work: Path, spawns: int) -> None:
+def measure(config: Config, agents: Iterable[tuple[str, Path]], work: Path, scenario: str, spawns: int) -> None:
     """Drive every agent that has not been driven."""
-    for name, directory, scenario in agents:
+    for name, directory in agents:
         path = work / "rows" / f"{scenario}-{spawns}-{file_name(name)}.parquet"
         if path.exists() and path.stat().st_mtime > (directory / "config.json").stat().st_mtime:
             continue
@@ -299,13 +305,9 @@ def shown(number: Estimate, digits: int = 2) -> str:
 def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> str:
     """Return the tables as Markdown."""
     mlps = f"Online DDQN has no Munchausen term, and no MLP a discount above {MLP_DISCOUNT}. "
-    if any(get_scenario(row.scenario).clock for row in rows):
-        mlps += (
-            f"Agents with `clock` in their names see the time that has passed in the episode, at a discount of "
-            f"{CLOCK_DISCOUNT}. "
-        )
     if config.recipe == "paper":
         mlps = "Step, batch and target updates of the baselines as the paper prints them. "
+    commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for row in rows))
     lines = [
         "# Scores",
         "",
@@ -315,10 +317,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         f"{differing(config.recipe)}{mlps}"
         "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
         "",
-        f"Made with `{command}`, commit {rows[-1].commit or 'unknown'}.",
+        f"Made with `{command}`; the rows are of the commits {commits}.",
     ]
-    # Whether the time is seen does not change the driving task; the agents' names tell.
-    rows = [replace(row, scenario=replace(get_scenario(row.scenario), clock=False).name) for row in rows]
     for scenario in dict.fromkeys(row.scenario for row in rows):
         here = [row for row in rows if row.scenario == scenario]
         clean = {
@@ -336,12 +336,11 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
                 (name, "slower"),
                 (name, teacher),
                 (name, "distilled"),
-                (name, name.removesuffix(", clock")),
                 (name, name.replace("RAPID", "online DDQN")),
                 (name, name.replace("RAPID", "online Munchausen DQN")),
             ]
         for name, other in pairs:
-            if other != name and other in clean and name in clean:
+            if other in clean and name in clean:
                 gain = difference(clean[name], clean[other])
                 crash = difference(clean[name], clean[other], "crashed")
                 lines.append(f"- {name} against {other}, paired: return {shown(gain)}, crash share {shown(crash, 3)}.")
@@ -379,15 +378,18 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     rows: list[EpisodeRow] = []
     own: list[EpisodeRow] = []
     for scenario in scenarios:
-        paths = [work / "rows" / f"{scenario}-{spawns}-teacher.parquet"]
-        for seen in (scenario, timed(scenario)):
-            paths += sorted(work.glob(f"{data or scenario}/seed-*/rows/{seen}-{spawns}-*.parquet"))
+        pattern = f"{data or scenario}/seed-*/rows/{scenario}-{spawns}-*.parquet"
+        paths = [work / "rows" / f"{scenario}-{spawns}-teacher.parquet", *sorted(work.glob(pattern))]
         here = [row for path in paths if path.exists() for row in load_rows(path)]
         own += here
         rows += [row for row in floors if row.scenario == scenario] + here
     if not own:
         raise SystemExit(f"Nothing has been measured over {spawns} spawns under '{work}'. Train first: see --help.")
-    name = "-".join(["scores", *(["paper"] if config.recipe == "paper" else []), *(["from", data] if data else [])])
+    marks = {
+        "paper": config.recipe == "paper",
+        "progress": all(get_scenario(s).reward == "progress" for s in scenarios),
+    }
+    name = "-".join(["scores", *(mark for mark, it_is in marks.items() if it_is), *(["from", data] if data else [])])
     save_rows(out / f"{name}.parquet", own)
     command = " ".join(["python", "benchmarks/scores.py", *sys.argv[1:]])
     write_text(out / f"{name}.md", report(rows, config, data, command))
@@ -405,7 +407,7 @@ def main() -> None:
         "--steps", type=int, nargs="*", default=[10_000, 100_000, 300_000], help="online steps; may be none"
     )
     parser.add_argument("--ablations", action="store_true", help="train RAPID without each of its parts as well")
-    parser.add_argument("--clock", action="store_true", help="train agents that see the time as well")
+    parser.add_argument("--only", nargs="+", default=[], help="agents to train and drive, by their names in the table")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")
     parser.add_argument("--out", type=Path, default=Path("results"), help="where the table goes")
@@ -423,8 +425,8 @@ def main() -> None:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
                 own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
-                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations, chosen.clock)
-                measure(own, agents, home, chosen.spawns)
+                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations, chosen.only)
+                measure(own, agents, home, scenario, chosen.spawns)
     table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)
 
 

@@ -81,7 +81,7 @@ def _judge(state: Any, settings: Any, out: Any) -> None:
 @numba.njit
 def _observe(state: Any, settings: Any, out: Any) -> None:
     for i in range(len(state.cars)):
-        observe(state.cars[i], state.tags[i], settings, out.observations[i])
+        observe(state.cars[i], state.tags[i], state.world[i], settings, out.observations[i])
 
 
 def profile(scenario: str, worlds: int, decisions: int, warmup: int) -> tuple[Phases, float]:

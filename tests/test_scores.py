@@ -90,25 +90,33 @@ def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config
     assert discounts["online Munchausen DQN, 300K"] == discounts["online DDQN, 300K"] == benchmark.MLP_DISCOUNT
 
 
-def test_agents_that_see_the_time_adapt_and_drive_where_it_is_told(benchmark, config, tmp_path, asked):
-    agents = benchmark.train(config, "lane-3-density-2", tmp_path, "lane-3-density-2", (10_000, 300_000), clock=True)
-    told = {agent.name for agent in agents if agent.scenario == "lane-3-density-2:clock"}
-    assert (
-        told
-        == {name for name in asked if "clock" in name}
-        == {
-            "RAPID, 300K, clock",
-            "online Munchausen DQN, 300K, clock",
-        }
-    )
-    for name in told:
-        timed, untold = (asked[each][0] for each in (name, name.removesuffix(", clock")))
-        loss = replace(untold.loss, discount=benchmark.CLOCK_DISCOUNT)
-        assert timed == replace(untold, scenario="lane-3-density-2:clock", loss=loss)
+def test_only_what_is_wanted_and_what_it_starts_from_is_trained(benchmark, config, tmp_path, asked, monkeypatch):
+    distilled = []
+    monkeypatch.setattr(benchmark.pipeline, "distill_agent", lambda *words: distilled.append(words[-1]))
+    work = (tmp_path, "lane-3-density-2", (10_000, 100_000))
+    agents = benchmark.train(config, "lane-3-density-2", *work, only=["online DDQN, 10K", "distilled"])
+    assert [name for name, _ in agents] == ["distilled", "online DDQN, 10K"]
+    assert distilled == ["distilled", "offline DDQN"]
+    assert list(asked) == ["online DDQN, 10K"]
+    with pytest.raises(RapidError, match="no agent 'RAPID, 1M' among 'distilled'"):
+        benchmark.train(config, "lane-3-density-2", *work, only=["RAPID, 1M"])
+
+
+def test_each_recipe_and_reward_has_a_table_of_its_own(benchmark, config, tmp_path):
+    for scenario in ("lane-3-density-2", "lane-3-density-2:progress"):
+        rows = [
+            replace(row, agent="distilled", commit="c0ffee00") for row in run_episodes(SCRIPTED, scenario, [0]).rows(0)
+        ]
+        path = tmp_path / scenario / "seed-0" / "rows" / f"{scenario}-1-distilled.parquet"
+        benchmark.save_rows(path, rows)
+        benchmark.save_rows(tmp_path / "floors.parquet", rows)
+        benchmark.table(tmp_path, [scenario], "", 1, config, tmp_path)
+    assert {path.name for path in tmp_path.glob("scores*.md")} == {"scores.md", "scores-progress.md"}
+    assert "the commits c0ffee0." in (tmp_path / "scores.md").read_text()
 
 
 def test_the_recipe_paper_has_its_online_dqn_as_printed(benchmark, tmp_path, asked):
-    benchmark.train(preset("paper", "full"), "lane-3-density-2", tmp_path, "lane-3-density-2", (10_000,))
+    benchmark.train(preset("paper", "full"), "lane-3-density-2", tmp_path, "lane-3-density-2", (10_000,), False)
     assert list(asked) == ["RAPID, 10K", "online DDQN, 10K", "online DQN, 10K"]
     rates = {name: (adapt.optimizer.learning_rate, adapt.loss.double) for name, (adapt, *_) in asked.items()}
     assert rates["online DQN, 10K"] == (5e-3, False)
