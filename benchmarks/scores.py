@@ -27,7 +27,7 @@ from rapid import pipeline
 from rapid.config import AdaptConfig, Config, TeacherConfig, preset
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
-from rapid.data.shipped import dataset_folder
+from rapid.data.shipped import dataset_folder, shipped_sets
 from rapid.errors import RapidError
 from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
@@ -50,6 +50,8 @@ SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
 MLP_DISCOUNT = 0.93
 """Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
+RULE_DATA = "distilled, rule data"
+"""RAPID distilled from the data of a rule in place of the teacher's, where such data is shipped."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
@@ -144,6 +146,8 @@ def train(
         RapidError: an agent of `only` does not exist, or one was trained with other settings.
     """
     offline = offline_recipes(config) | (offline_ablations(config) if ablations else {})
+    if ablations and f"{get_scenario(data).name}/rule" in shipped_sets():
+        offline[RULE_DATA] = config
     online: dict[str, Adaptation] = {}
     for steps in budgets:
         online |= online_recipes(config, scenario, steps, ablations)
@@ -152,18 +156,15 @@ def train(
         if name not in offline and name not in online:
             names = ", ".join(f"'{name}'" for name in (*offline, *online))
             raise RapidError(f"There is no agent '{name}' among {names}. Choose others, or other --steps.")
-    mixture = work / "mix"
-    if not (mixture / "dataset.json").exists():
-        teacher, random = datasets(data, work.parent)
-        work.mkdir(parents=True, exist_ok=True)
-        pipeline.mix_datasets(config, teacher, random, mixture)
+    mixture = mixed(config, data, work)
     agents: list[tuple[str, Path]] = []
     origins = {online[name].origin for name in wanted if name in online}
     for name, settings in offline.items():
         home = work / file_name(name)
         if name in wanted or name in origins:
             if not is_trained(home, settings, "distill"):
-                pipeline.distill_agent(settings, mixture, home, name)
+                learned_from = mixed(config, data, work, "rule") if name == RULE_DATA else mixture
+                pipeline.distill_agent(settings, learned_from, home, name)
             if name in wanted:
                 agents.append((name, home / "agent"))
     for name, (settings, origin, with_data) in online.items():
@@ -227,11 +228,20 @@ def flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
     return found
 
 
-def datasets(scenario: str, work: Path) -> tuple[Path, Path]:
-    """Return where the teacher's and the random data of a scenario lie; under `work` if its reward is another."""
+def mixed(config: Config, scenario: str, work: Path, driver: str = "teacher") -> Path:
+    """Return where a driver's data of a scenario lies mixed with random data; it is mixed if it is not there."""
+    mixture = work / ("mix" if driver == "teacher" else f"mix-{driver}")
+    if not (mixture / "dataset.json").exists():
+        work.mkdir(parents=True, exist_ok=True)
+        pipeline.mix_datasets(config, *datasets(scenario, work.parent, driver), mixture)
+    return mixture
+
+
+def datasets(scenario: str, work: Path, driver: str = "teacher") -> tuple[Path, Path]:
+    """Return where the data of a driver and of the random one lie; under `work` if the reward is not the shipped."""
     driven = replace(get_scenario(scenario), reward="normalized").name
     folders: list[Path] = []
-    for name in ("teacher", "random"):
+    for name in (driver, "random"):
         shipped = f"shipped:{driven}/{name}"
         folder = dataset_folder(shipped) if driven == scenario else work / name
         if not (folder / "dataset.json").exists():
@@ -339,6 +349,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
                 (name, name.replace("RAPID", "online DDQN")),
                 (name, name.replace("RAPID", "online Munchausen DQN")),
             ]
+        # An ablation is called after what it ablates.
+        pairs += [(whole, name) for whole in clean for name in clean if name.startswith(f"{whole}, ")]
         for name, other in pairs:
             if other in clean and name in clean:
                 gain = difference(clean[name], clean[other])
@@ -406,7 +418,11 @@ def main() -> None:
     parser.add_argument(
         "--steps", type=int, nargs="*", default=[10_000, 100_000, 300_000], help="online steps; may be none"
     )
-    parser.add_argument("--ablations", action="store_true", help="train RAPID without each of its parts as well")
+    parser.add_argument(
+        "--ablations",
+        action="store_true",
+        help="train RAPID without each of its parts, and from a rule's data, as well",
+    )
     parser.add_argument("--only", nargs="+", default=[], help="agents to train and drive, by their names in the table")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")

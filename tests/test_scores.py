@@ -102,6 +102,20 @@ def test_only_what_is_wanted_and_what_it_starts_from_is_trained(benchmark, confi
         benchmark.train(config, "lane-3-density-2", *work, only=["RAPID, 1M"])
 
 
+def test_the_rules_data_takes_the_teachers_place(benchmark, config, tmp_path, asked, monkeypatch):
+    mixed, learned = [], {}
+    monkeypatch.setattr(benchmark, "datasets", lambda _, work, driver: (work / driver, work / "random"))
+    monkeypatch.setattr(benchmark.pipeline, "mix_datasets", lambda _, driver, random, out: mixed.append(driver.name))
+    monkeypatch.setattr(benchmark.pipeline, "distill_agent", lambda _, data, out, name: learned.update({name: data}))
+    names = ["distilled", benchmark.RULE_DATA]
+    work = tmp_path / "work"
+    benchmark.train(config, "lane-3-density-2", work, "lane-3-density-2", (), ablations=True, only=names)
+    assert mixed == ["teacher", "rule"]
+    assert learned == {"distilled": work / "mix", benchmark.RULE_DATA: work / "mix-rule"}
+    with pytest.raises(RapidError, match="no agent"):  # no rule's data of this scenario is shipped
+        benchmark.train(config, "lane-4-density-2", work, "lane-4-density-2", (), ablations=True, only=names)
+
+
 def test_each_recipe_and_reward_has_a_table_of_its_own(benchmark, config, tmp_path):
     for scenario in ("lane-3-density-2", "lane-3-density-2:progress"):
         rows = [
