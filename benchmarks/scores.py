@@ -15,6 +15,7 @@ ours, and `scores-progress` for the reward `progress`. Of the floors and the pla
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -403,7 +404,7 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     }
     name = "-".join(["scores", *(mark for mark, it_is in marks.items() if it_is), *(["from", data] if data else [])])
     save_rows(out / f"{name}.parquet", own)
-    command = " ".join(["python", "benchmarks/scores.py", *sys.argv[1:]])
+    command = shlex.join(["python", "benchmarks/scores.py", *sys.argv[1:]])
     write_text(out / f"{name}.md", report(rows, config, data, command))
     print(f"Wrote {out / name}.md")
 
