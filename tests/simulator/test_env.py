@@ -122,6 +122,10 @@ def test_a_clock_is_told_in_the_egos_presence_and_nowhere_else() -> None:
             (seen, *rest), (expected, *_), (without, *others) = (env.step(SLOWER) for env in envs)
             assert _same(rest, others)
     assert rest[2]  # the time is up
+    for simulator in ("compiled", "highway-env"):
+        config = {"observation": {"features": ["x"], "clock": True}}
+        with pytest.raises(RapidError, match=r"observation\.clock"):
+            make_env(FAST, simulator, config=config)
 
 
 @pytest.mark.parametrize("action", [5, -1, 1.0, "1", True, None, [1], np.array([1]), np.float32(1)])

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rapid.errors import RapidError
 from rapid.scenarios import Scenario, get_scenario
-from rapid.simulator.settings import merge_config, read_integer
+from rapid.simulator.settings import clock_column, merge_config, read_integer
 from rapid.simulator.state import (
     CAR_ROWS,
     CRASHED,
@@ -132,15 +132,13 @@ def make_reference_env(
     except ImportError as error:
         raise RapidError("highway-env is not installed. Run: pip install highway-env") from error
     merged = merge_config(chosen.config(), config)
-    observation = merged["observation"]
-    clock = observation["features"].index("presence") if observation.get("clock") else -1
     made = gymnasium.make(
         chosen.env_id,
         render_mode=render_mode,
         config=merged,
         disable_env_checker=True,  # it would step and reset once more, at highway-env's price
     )
-    return ReferenceHighwayEnv(made, clock)
+    return ReferenceHighwayEnv(made, clock_column(merged["observation"]))
 
 
 def make_reference_vec(

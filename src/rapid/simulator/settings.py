@@ -251,11 +251,6 @@ def _read_observation(observation: Any, lanes: int) -> dict[str, Any]:
         if not isinstance(given, Mapping):
             raise RapidError(f"observation.features_range must map feature names to [low, high]; got {given!r}.")
         ranges = {name: _interval(pair, f"observation.features_range.{name}") for name, pair in given.items()}
-    clock = _flag(observation, "clock", False)
-    if clock and "presence" not in names:
-        raise RapidError(
-            "observation.clock adds the time to the ego's presence, which is not in observation.features. Add it."
-        )
     low, high = np.array([ranges.get(name, (-1.0, 1.0)) for name in names]).T
     return {
         # One row would mean no room for traffic; highway-env then returns more rows than its space says.
@@ -268,8 +263,24 @@ def _read_observation(observation: Any, lanes: int) -> dict[str, Any]:
         "scaled": np.array([name in ranges for name in names]),
         "low": np.ascontiguousarray(low),
         "high": np.ascontiguousarray(high),
-        "clock": names.index("presence") if clock else -1,
+        "clock": clock_column(observation),
     }  # fmt: skip
+
+
+def clock_column(observation: Mapping[str, Any]) -> int:
+    """Return the column of a Kinematics observation that tells the time in the ego's row, or -1 for none.
+
+    Raises:
+        RapidError: a clock without the feature that it is told in.
+    """
+    if not _flag(observation, "clock", False):
+        return -1
+    names = list(observation.get("features") or FEATURES[:5])
+    if "presence" not in names:
+        raise RapidError(
+            "observation.clock adds the time to the ego's presence, which is not in observation.features. Add it."
+        )
+    return names.index("presence")
 
 
 def _check_part(part: Any, name: str, kind: str, keys: Sequence[str]) -> None:
