@@ -59,9 +59,9 @@ def q_loss(
         q_BA, robust = network(batch.obs_BVF), zero
     else:
         # One pass over the clean and the attacked observations is faster than two.
-        attacked_obs, labels = attacked
+        attacked_obs, labels, weights = attacked
         q_BA, attacked_q = network(torch.cat([batch.obs_BVF, attacked_obs])).split([len(target_B), len(labels)])
-        robust = cross_entropy(attacked_q, labels, config.temperature)
+        robust = cross_entropy(attacked_q, labels, config.temperature, weights)
     td = td_loss(q_BA, batch.action_B, target_B, config.td_error)
     conservative = conservative_loss(q_BA, batch.action_B) if config.conservative_weight else zero
     total = td + config.conservative_weight * conservative + config.robust_weight * robust
@@ -116,9 +116,15 @@ def conservative_loss(q_BA: Tensor, action_B: Tensor) -> Tensor:
     return (q_BA.logsumexp(1) - _taken(q_BA, action_B)).mean()
 
 
-def cross_entropy(q_BA: Tensor, labels_BA: Tensor, temperature: float = 1.0) -> Tensor:
-    """Return the mean of -sum label log softmax(Q/T); for one-hot labels the KL divergence (paper: equation 5)."""
-    return -(labels_BA * (q_BA / temperature).log_softmax(1)).sum(1).mean()
+def cross_entropy(
+    q_BA: Tensor, labels_BA: Tensor, temperature: float = 1.0, weights_B: Tensor | None = None
+) -> Tensor:
+    """Return the mean of -sum label log softmax(Q/T); for one-hot labels the KL divergence (paper: equation 5).
+
+    With weights of 0 and 1 the mean is over the rows of weight 1; it is 0 where there are none.
+    """
+    loss_B = -(labels_BA * (q_BA / temperature).log_softmax(1)).sum(1)
+    return loss_B.mean() if weights_B is None else (loss_B * weights_B).sum() / weights_B.sum().clamp_min(1)
 
 
 def behavior_cloning_loss(network: QNetwork, batch: TransitionBatch, teacher_only: bool = False) -> QLoss:
@@ -135,8 +141,11 @@ def behavior_cloning_loss(network: QNetwork, batch: TransitionBatch, teacher_onl
 
 def _attack(
     network: QNetwork, batch: TransitionBatch, config: LossConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor] | None:
-    """Return s~ and the labels of the transitions that get the robust term, or None if there are none."""
+) -> tuple[Tensor, Tensor, Tensor | None] | None:
+    """Return s~, labels and weights for the transitions that get the robust term, or None if there are none.
+
+    Without weights every row counts.
+    """
     labels_BA = functional.one_hot(batch.action_B, NUM_ACTIONS).to(batch.obs_BVF.dtype)
     if config.robust_labels == "soft":
         if batch.soft_BA is None:
@@ -145,13 +154,16 @@ def _attack(
                 "Set loss.robust_labels to 'hard', or collect data with a teacher that reports them."
             )
         labels_BA = torch.where(batch.soft_BA.isfinite().all(1, keepdim=True), batch.soft_BA, labels_BA)
-    obs_BVF = batch.obs_BVF
-    if config.robust_on == "teacher":
+    obs_BVF, weights_B = batch.obs_BVF, None
+    if config.robust_on == "teacher" and obs_BVF.is_cuda:
+        # To pick rows, Python would have to wait for their number; a GPU attacks all of them as fast as some.
+        weights_B = batch.teacher_B.to(obs_BVF.dtype)
+    elif config.robust_on == "teacher":
         obs_BVF, labels_BA = obs_BVF[batch.teacher_B], labels_BA[batch.teacher_B]
         if not len(obs_BVF):
             return None
     attacked = maximize_loss(network, obs_BVF, labels_BA, network.scale_F, config.robust, config.temperature, generator)
-    return attacked, labels_BA
+    return attacked, labels_BA, weights_B
 
 
 def _taken(q_BA: Tensor, action_B: Tensor) -> Tensor:

@@ -98,6 +98,6 @@ def _random_offset(obs_BVF: Tensor, free_F: Tensor, config: RobustConfig, genera
     else:
         noise_BVF = torch.randn(obs_BVF.shape, generator=generator, device=device).to(obs_BVF.device) * free_F
         share_B11 = torch.rand(obs_BVF.shape[0], 1, 1, generator=generator, device=device).to(obs_BVF.device)
-        dimensions = obs_BVF.shape[1] * float(free_F.sum())
+        dimensions = obs_BVF.shape[1] * (obs_BVF.shape[2] - (not config.attack_presence))
         offset_BVF = _direction(noise_BVF, "l2") * config.radius * share_B11 ** (1 / dimensions)
     return _project(offset_BVF, config)

@@ -94,7 +94,8 @@ class MixtureOfPolicies(nn.Module):
 
     def _runs(self, index: int, router_BVN: Tensor) -> bool:
         """Whether the policy can change the output or a gradient; if not, leaving it out changes no bit."""
-        if index == 0:
+        if index == 0 or (router_BVN.is_cuda and torch.cuda.is_current_stream_capturing()):
+            # A recording cannot ask for values, and is replayed with others.
             return True
         if self.top_k < len(self.policies) and not bool(router_BVN[..., index].any()):
             return False

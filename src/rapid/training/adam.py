@@ -54,8 +54,13 @@ class Adam:
         self._count = torch.zeros((), device=self._weights[0].device)
 
     @torch.no_grad()
-    def step(self, gradients: Sequence[Tensor], learning_rate: float) -> None:
-        """Take one step of the size `learning_rate` down the gradients, one for each parameter."""
+    def step(self, gradients: Sequence[Tensor], learning_rate: float | Tensor) -> None:
+        """Take one step down the gradients, one for each parameter.
+
+        Args:
+            gradients: of the parameters, in their order.
+            learning_rate: the size of the step; a scalar tensor on the parameters' device spares waiting for it.
+        """
         self._count += 1
         for rate, group in self._groups.items():
             torch._fused_adam_(  # pyright: ignore[reportPrivateUsage]

@@ -12,6 +12,7 @@ from rapid.errors import RapidError
 from rapid.losses import behavior_cloning_loss, q_loss
 from rapid.networks.q_network import QNetwork
 from rapid.training.adam import Adam, clip_norm
+from rapid.training.capture import CapturedStep
 
 TERMS = ("td", "conservative", "robust", "total", "grad_norm")
 """What is recorded of every update; `grad_norm` is before clipping, and 0 where nothing is clipped."""
@@ -43,6 +44,13 @@ class Learner:
         rates = [config.gate_rate if parameter is network.gate else 1.0 for parameter in self._trained]
         self._adam = Adam(self._trained, rates)
         self._terms: list[Tensor] = []
+        self._step_size: Tensor | None = None
+        self._step = self._take_step
+        device = self._trained[0].device
+        if device.type == "cuda":
+            # A recorded step reads its size from here; a number would be recorded with it.
+            self._step_size = torch.zeros((), device=device)
+            self._step = CapturedStep(self._take_step, generator)
 
     @property
     def learning_rate(self) -> float:
@@ -52,6 +60,16 @@ class Learner:
 
     def update(self, batch: TransitionBatch) -> None:
         """Take one gradient step on the batch (paper: equation 5)."""
+        if self._step_size is not None:
+            self._step_size.fill_(self.learning_rate)
+        # Kept as a tensor: asking for its value would make every step wait for the device.
+        self._terms.append(self._step(batch))
+        self.updates += 1
+        if self.updates % self.config.target_update == 0:
+            self._update_target()
+
+    def _take_step(self, batch: TransitionBatch) -> Tensor:
+        """Move the weights and return the terms of the loss, as `TERMS` names them."""
         if self.config.algorithm == "bc":
             loss = behavior_cloning_loss(self.network, batch, teacher_only=self.loss.robust_on == "teacher")
         else:
@@ -61,12 +79,8 @@ class Learner:
         norm = torch.zeros_like(loss.total)
         if self.config.max_grad_norm:
             norm = clip_norm(gradients, self.config.max_grad_norm)
-        self._adam.step(gradients, self.learning_rate)
-        self.updates += 1
-        if self.updates % self.config.target_update == 0:
-            self._update_target()
-        # Kept as a tensor: asking for its value would make every step wait for the device.
-        self._terms.append(torch.stack([*loss, norm]).detach())
+        self._adam.step(gradients, self.learning_rate if self._step_size is None else self._step_size)
+        return torch.stack([*loss, norm]).detach()
 
     @torch.no_grad()
     def _update_target(self) -> None:
