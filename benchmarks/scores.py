@@ -424,6 +424,7 @@ def main() -> None:
         action="store_true",
         help="train RAPID without each of its parts, and from a rule's data, as well",
     )
+    parser.add_argument("--device", default="cpu", help="where agents are trained; they drive on the CPU")
     parser.add_argument("--only", nargs="+", default=[], help="agents to train and drive, by their names in the table")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")
@@ -432,7 +433,7 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="only write the table of what is there")
     chosen = parser.parse_args()
     config = preset(chosen.recipe, "full")
-    config = replace(config, evaluate=replace(config.evaluate, curve_spawns=0))
+    config = replace(config, device=chosen.device, evaluate=replace(config.evaluate, curve_spawns=0))
     work = chosen.work / chosen.recipe
     if not chosen.table:
         pipeline.check(config)

@@ -116,9 +116,7 @@ def conservative_loss(q_BA: Tensor, action_B: Tensor) -> Tensor:
     return (q_BA.logsumexp(1) - _taken(q_BA, action_B)).mean()
 
 
-def cross_entropy(
-    q_BA: Tensor, labels_BA: Tensor, temperature: float = 1.0, weights_B: Tensor | None = None
-) -> Tensor:
+def cross_entropy(q_BA: Tensor, labels_BA: Tensor, temperature: float = 1.0, weights_B: Tensor | None = None) -> Tensor:
     """Return the mean of -sum label log softmax(Q/T); for one-hot labels the KL divergence (paper: equation 5).
 
     With weights of 0 and 1 the mean is over the rows of weight 1; it is 0 where there are none.

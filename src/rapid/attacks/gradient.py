@@ -44,7 +44,7 @@ def maximize_loss(
         obs_BVF, labels_BA = obs_BVF.detach().clone(), labels_BA.detach().clone()
         free_F = torch.ones_like(scale_F)
         if not config.attack_presence:
-            free_F[0] = 0
+            free_F[:1].zero_()
         if config.random_start:
             offset_BVF = _random_offset(obs_BVF, free_F, config, generator)
         else:
