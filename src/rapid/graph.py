@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from rapid.networks.blocks import Block, Transformer
 from rapid.networks.encoding import BESIDE, NEAR, NEAR_FEATURES
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
-from rapid.networks.q_network import ActionDecoder, MlpHead, QNetwork
+from rapid.networks.mlp import MlpHead
+from rapid.networks.q_network import ActionDecoder, QNetwork, TokenHead
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
 
 OPSET, IR_VERSION = 17, 8
@@ -107,7 +108,8 @@ def _q_values(graph: Graph, network: QNetwork) -> str:
     present = None
     if encoding.mask_absent:
         present = graph.node("Greater", graph.cut("obs", 0, 1, 2), _array(encoding.absent_V1))
-    if isinstance(head, MlpHead):
+    if not isinstance(head, TokenHead):
+        assert isinstance(head, MlpHead), "a stack is no agent"
         if present:
             features = graph.node("Where", present, features, 0.0)
         return _mlps(graph, head, features, read_GF)

@@ -5,7 +5,8 @@ import torch
 
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
-from rapid.networks.q_network import MlpHead, TokenHead, build_network, set_phase
+from rapid.networks.mlp import MlpHead
+from rapid.networks.q_network import TokenHead, build_network, set_phase
 
 SMALL = {"width": 16, "heads": 2, "feedforward": 32, "hidden": (24, 24)}
 KINDS = ("rapid", "attentive", "mlp", "mlp-mixture")

@@ -99,13 +99,15 @@ class OfflineSampler:
     def __len__(self) -> int:
         return len(self.store.action_B)
 
-    def sample(self, size: int, rng: np.random.Generator) -> TransitionBatch:
-        """Return `size` transitions, drawn with replacement."""
+    def sample(self, size: int, *rngs: np.random.Generator) -> TransitionBatch:
+        """Return `size` transitions for each generator, in their order, drawn with replacement."""
         # The first group gets its share, rounded; the other one, if there is one, the rest.
         count = int(np.floor(self._groups[0][1] * size + 0.5))
         counts = (count, size - count)
         drawn = [
-            rows[rng.integers(len(rows), size=part)] for (rows, _), part in zip(self._groups, counts, strict=False)
+            rows[rng.integers(len(rows), size=part)]
+            for rng in rngs
+            for (rows, _), part in zip(self._groups, counts, strict=False)
         ]
         return _take(self.store, torch.from_numpy(np.concatenate(drawn)).to(self._device))
 

@@ -109,8 +109,10 @@ def save_agent(directory: str | os.PathLike[str], network: QNetwork, metadata: d
         metadata: plain JSON values: how it was made.
 
     Raises:
-        RapidError: the directory cannot be written.
+        RapidError: the directory cannot be written, or `network` is a stack.
     """
+    if network.members > 1:
+        raise RapidError("A stack holds several agents. Save each of those that `unstack_networks` returns.")
     folder = Path(directory)
     # A clone each, since safetensors refuses tensors that share memory.
     weights = {key: value.detach().cpu().contiguous().clone() for key, value in network.state_dict().items()}

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.blocks import Transformer
-from rapid.networks.encoding import Encoding, num_inputs
+from rapid.networks.encoding import Encoding
 from rapid.networks.mixture import MixtureOfPolicies
+from rapid.networks.mlp import MlpHead, MlpStack
 from rapid.scenarios import NUM_ACTIONS, NUM_VEHICLES
 from rapid.seeding import torch_stream
 
@@ -78,35 +79,6 @@ class TokenHead(nn.Module):
         return self.decoder(self.mixture(features_BVF, mask_B11V), mask_B11V)
 
 
-class MlpHead(nn.Module):
-    """Weighted sum of the Q-values of N multilayer perceptrons over the flattened observation.
-
-    With N = 1 this is the baselines' network (paper: hyperparameter table); with more it is the mixture of *actions*
-    that the remark in section 3.3 compares against: weights learned, but the same for every vehicle and state. They
-    start at (1, 0, ..., 0), so that the two training phases mean the same as for the mixture of policies.
-    """
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        count = config.num_policies if config.kind == "mlp-mixture" else 1
-        self.mlps = nn.ModuleList(self._mlp(num_inputs(config.input), config.hidden) for _ in range(count))
-        self.weights_N = nn.Parameter(torch.zeros(count)) if count > 1 else None
-
-    @staticmethod
-    def _mlp(inputs: int, hidden: tuple[int, ...]) -> nn.Sequential:
-        sizes = (NUM_VEHICLES * inputs, *hidden)
-        layers: list[nn.Module] = [nn.Flatten()]
-        for before, after in zip(sizes, hidden, strict=False):
-            layers += [nn.Linear(before, after), nn.ReLU()]
-        return nn.Sequential(*layers, nn.Linear(sizes[-1], NUM_ACTIONS))
-
-    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
-        """Return the Q-values (B, A); the features of absent rows are zero already, so the mask has no use here."""
-        if self.weights_N is None:
-            return self.mlps[0](features_BVF)
-        return torch.stack([mlp(features_BVF) for mlp in self.mlps], -1) @ self.weights_N
-
-
 class QNetwork(nn.Module):
     """Raw observations (B, V, F) in, Q-values (B, A) out; the policy is their argmax."""
 
@@ -114,7 +86,13 @@ class QNetwork(nn.Module):
         super().__init__()
         self.config, self.lanes = config, lanes
         self.encoding = Encoding(config.input, lanes, config.mask_absent)
+        self.head: TokenHead | MlpHead | MlpStack
         self.head = TokenHead(config) if config.kind in ("rapid", "attentive") else MlpHead(config)
+
+    @property
+    def members(self) -> int:
+        """How many networks this is: 1 unless it is a stack (:mod:`rapid.networks.stack`)."""
+        return self.head.members if isinstance(self.head, MlpStack) else 1
 
     @property
     def scale_F(self) -> Tensor:
@@ -200,6 +178,11 @@ def set_phase(network: QNetwork, phase: Phase, freeze_decoder: bool = False) -> 
         RapidError: `adapt` on a network without adapters, or `freeze_decoder` on one without a decoder.
     """
     head, gate = network.head, network.gate
+    if isinstance(head, MlpStack):
+        if phase == "adapt" or freeze_decoder:
+            raise RapidError("A stack of networks trains every weight. Train one network at a time instead.")
+        network.requires_grad_(True)
+        return
     first, *adapters = head.mixture.policies if isinstance(head, TokenHead) else head.mlps
     if phase == "adapt" and not adapters:
         raise RapidError(

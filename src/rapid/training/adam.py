@@ -95,8 +95,17 @@ class Adam:
 
 
 @torch.no_grad()
-def clip_norm(gradients: tuple[Tensor, ...] | list[Tensor], largest: float) -> Tensor:
-    """Scale the gradients in place so that their norm, all together, is at most `largest`; return what it was."""
+def clip_norm(gradients: tuple[Tensor, ...] | list[Tensor], largest: float, members: int = 1) -> Tensor:
+    """Scale the gradients in place so that their norm, all together, is at most `largest`; return what it was.
+
+    With several members, the first axis of every gradient, each has a norm of its own: the result is (S,).
+    """
+    if members > 1:
+        norm_S = torch.stack([gradient.flatten(1).square().sum(1) for gradient in gradients]).sum(0).sqrt()
+        scale_S = (largest / (norm_S + 1e-6)).clamp(max=1.0)
+        for gradient in gradients:
+            gradient.mul_(scale_S.view(-1, *[1] * (gradient.dim() - 1)))
+        return norm_S
     norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))  # pyright: ignore[reportPrivateUsage]
     torch._foreach_mul_(gradients, (largest / (norm + 1e-6)).clamp(max=1.0))  # pyright: ignore[reportPrivateUsage]
     return norm

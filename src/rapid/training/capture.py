@@ -5,6 +5,7 @@ kernels. A recorded update is launched as one. It computes the same: the same ke
 """
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -59,7 +60,8 @@ class CapturedStep:
 
     def _record(self, batch: TransitionBatch) -> None:
         """Record the step; nothing is computed yet."""
-        self._given = TransitionBatch(*(None if tensor is None else tensor.clone() for tensor in batch))
+        copies = [cast(Tensor, None if tensor is None else tensor.clone()) for tensor in batch]
+        self._given = TransitionBatch(*copies)
         self._graph = torch.cuda.CUDAGraph()
         self._graph.register_generator_state(self._generator)
         with torch.cuda.graph(self._graph):

@@ -15,14 +15,15 @@ from rapid.training.adam import Adam, clip_norm
 from rapid.training.capture import CapturedStep
 
 TERMS = ("td", "conservative", "robust", "total", "grad_norm")
-"""What is recorded of every update; `grad_norm` is before clipping, and 0 where nothing is clipped."""
+"""What is recorded of every update; `grad_norm` is before clipping, and 0 where nothing is clipped. Of a stack, means
+over its members."""
 
 
 class Learner:
     """Trains the parameters of `network` that require a gradient; everything else stays as it is, bit for bit.
 
     Args:
-        network: is trained in place.
+        network: is trained in place. A stack's members learn as they would alone, each from its part of every batch.
         config: the optimiser.
         loss: the loss.
         updates: gradient steps that are planned; the step size falls to zero over them if `config.linear_decay`.
@@ -75,10 +76,13 @@ class Learner:
         else:
             loss = q_loss(self.network, self.target, batch, self.loss, self.generator)
         # A weight that this batch has no use for gets the gradient 0: the same as if it had been used in vain.
-        gradients = torch.autograd.grad(loss.total, self._trained, materialize_grads=True)
-        norm = torch.zeros_like(loss.total)
+        # The mean over a stack's batch has each member's own mean for a share only.
+        members = self.network.members
+        total = loss.total if members == 1 else loss.total * members
+        gradients = torch.autograd.grad(total, self._trained, materialize_grads=True)
+        norm = torch.zeros_like(total)
         if self.config.max_grad_norm:
-            norm = clip_norm(gradients, self.config.max_grad_norm)
+            norm = clip_norm(gradients, self.config.max_grad_norm, members).mean()
         self._adam.step(gradients, self.learning_rate if self._step_size is None else self._step_size)
         return torch.stack([*loss, norm]).detach()
 

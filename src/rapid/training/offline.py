@@ -4,6 +4,7 @@ DQN, double DQN, CQL and behaviour cloning are settings of the one loop, for eve
 """
 
 import os
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -14,6 +15,7 @@ from rapid.data.replay import OfflineSampler
 from rapid.data.transitions import TEACHER, Transitions
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, set_phase
+from rapid.networks.stack import unstack_networks
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, torch_stream
 from rapid.settings import to_dict
@@ -30,7 +32,7 @@ def distill(
     network: QNetwork,
     config: DistillConfig,
     directory: str | os.PathLike[str],
-    seed: int,
+    seed: int | Sequence[int],
     evaluate: Evaluate | None = None,
     progress: Task | None = None,
     *,
@@ -42,11 +44,12 @@ def distill(
 
     Args:
         transitions: the dataset, teacher and random transitions mixed.
-        network: policy 1, the router and the decoder are trained (phase `distill`).
+        network: policy 1, the router and the decoder are trained (phase `distill`). Of a stack
+            (:mod:`rapid.networks.stack`) every member is trained as it would be alone.
         config: iterations, loss, optimiser.
         directory: where ``metrics.jsonl`` and the checkpoint go.
-        seed: of the batches and the inner attack.
-        evaluate: called every `config.evaluate_every` iterations and at the end.
+        seed: of the batches and the inner attack; of a stack one for each member.
+        evaluate: called every `config.evaluate_every` iterations and at the end, for each member of a stack.
         progress: counts iterations.
         teacher_share: see `Dataset.teacher_share`.
         checkpoint_seconds: time between two checkpoints.
@@ -57,6 +60,8 @@ def distill(
             checkpoint stays), or a directory of another training.
     """
     check_labels(transitions, config.loss, config.optimizer.algorithm)
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    _check_members(network, seeds, config)
     device = str(next(network.parameters()).device)
     set_phase(network, "distill")
     record = Record(
@@ -68,28 +73,29 @@ def distill(
             "weights": network_fingerprint(network),
             "data": data_fingerprint(transitions),
             "teacher_share": teacher_share,
-            "seed": seed,
+            "seed": seeds[0] if len(seeds) == 1 else seeds,
         },
         checkpoint_seconds,
         track,
     )
     sampler = OfflineSampler(transitions, config.loss.discount, config.loss.n_step, device, teacher_share)
-    rng = numpy_stream(seed, "distill/batches")
-    learner = Learner(
-        network, config.optimizer, config.loss, config.iterations, torch_stream(seed, "distill/attack", device)
-    )
+    rngs = [numpy_stream(each, "distill/batches") for each in seeds]
+    attack = torch_stream(seeds[0], "distill/attack", device)
+    learner = Learner(network, config.optimizer, config.loss, config.iterations, attack)
 
     def state() -> dict[str, Any]:
-        return {"learner": learner.state_dict(), "rng": rng.bit_generator.state}
+        first, *others = (rng.bit_generator.state for rng in rngs)
+        return {"learner": learner.state_dict(), "rng": first, "other_rngs": others}
 
     if (saved := record.resume()) is not None:
         learner.load_state_dict(saved["learner"])
-        rng.bit_generator.state = saved["rng"]
+        for rng, was in zip(rngs, [saved["rng"], *saved.get("other_rngs", [])], strict=True):
+            rng.bit_generator.state = was
         if progress:
             progress.skip(learner.updates)
 
     while learner.updates < config.iterations:
-        learner.update(sampler.sample(config.optimizer.batch_size, rng))
+        learner.update(sampler.sample(config.optimizer.batch_size, *rngs))
 
         done = learner.updates
         last = done == config.iterations
@@ -98,13 +104,30 @@ def distill(
             continue
         row = {"iteration": done, **learner.means(), "learning_rate": learner.learning_rate, "seconds": record.seconds}
         if evaluate and measure and config.evaluate_every:
-            row["evaluation"] = evaluate(network, done)
+            found = [evaluate(each, done) for each in ([network] if len(seeds) == 1 else unstack_networks(network))]
+            row["evaluation"] = found[0] if len(seeds) == 1 else found
         record.write(row)
         record.checkpoint(state, now=last)
         if progress:
             progress.advance(done - progress.done)
             progress.note(f"loss {row['total']:.3g}")
     return network
+
+
+def _check_members(network: QNetwork, seeds: Sequence[int], config: DistillConfig) -> None:
+    """Raise unless there is a seed for each member, and the loss of a stack is the mean of its members' losses.
+
+    The robust and the Munchausen term put two batches behind each other, which no stack can read.
+    """
+    if len(seeds) != network.members:
+        raise RapidError(f"There are {len(seeds)} seeds for {network.members} networks. Give one for each.")
+    teacher_only = config.optimizer.algorithm == "bc" and config.loss.robust_on == "teacher"
+    if len(seeds) > 1 and (config.loss.robust_weight > 0 or config.loss.munchausen_weight > 0 or teacher_only):
+        raise RapidError(
+            "A stack of networks has no robust and no Munchausen term, and does not clone the teacher's transitions "
+            "alone. Train each network by itself, or set loss.robust_weight and loss.munchausen_weight to 0 and "
+            "loss.robust_on to 'all'."
+        )
 
 
 def check_labels(transitions: Transitions, loss: LossConfig, algorithm: str) -> None:
