@@ -43,6 +43,7 @@ from rapid.files import cache_dir, write_json, write_text
 from rapid.losses import q_loss
 from rapid.networks.agent import QAgent
 from rapid.networks.q_network import QNetwork, build_network
+from rapid.networks.stack import stack_networks
 from rapid.pipeline import baseline, collect_transitions
 from rapid.progress import task
 from rapid.runs import commit as source_commit
@@ -208,7 +209,7 @@ def compare_speed(worker: Worker, dataset: Dataset, work: Path, rounds: int, ste
 
 
 def compare_together(worker: Worker, dataset: Dataset, work: Path, seeds: int, iterations: int) -> list[dict[str, Any]]:
-    """Return the seconds of several seeds: RAPID's a process each, all begun together, d3rlpy's one after another.
+    """Return the seconds of several seeds: RAPID's as stacks, one a core, begun together, d3rlpy's one after another.
 
     Ours count the start of the processes and reading the data; theirs only `fit`.
     """
@@ -218,14 +219,15 @@ def compare_together(worker: Worker, dataset: Dataset, work: Path, seeds: int, i
     # One process imports torch and RAPID, and the others are forked from it.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["rapid.training.offline", "rapid.data.exchange"])
+    parts = [part.tolist() for part in np.array_split(np.arange(seeds), min(os.cpu_count() or 1, seeds))]
     results: list[dict[str, Any]] = []
     with task("together", len(KINDS), "algorithms") as progress:
         for kind in KINDS:
             start = time.perf_counter()
-            with ProcessPoolExecutor(seeds, context) as pool:
+            with ProcessPoolExecutor(len(parts), context) as pool:
                 ended = [
-                    pool.submit(train_alone, work / "data", kind, iterations, work / f"{kind}-together-{seed}", seed)
-                    for seed in range(seeds)
+                    pool.submit(train_stack, work / "data", kind, iterations, work / f"{kind}-stack-{part[0]}", part)
+                    for part in parts
                 ]
                 for each in ended:
                     each.result()
@@ -239,12 +241,12 @@ def compare_together(worker: Worker, dataset: Dataset, work: Path, seeds: int, i
     return results
 
 
-def train_alone(folder: Path, kind: str, iterations: int, directory: Path, seed: int) -> None:
-    """Train one seed, in a process of its own."""
+def train_stack(folder: Path, kind: str, iterations: int, directory: Path, seeds: list[int]) -> None:
+    """Train some seeds as one stack, in a process of its own."""
     torch.set_num_threads(1)
     dataset = load_dataset(folder)
-    network = build_network(NETWORK, get_scenario(dataset.scenario).lanes, seed)
-    distill(dataset.transitions, network, settings(kind, iterations), directory, seed=seed)
+    stack = stack_networks([build_network(NETWORK, get_scenario(dataset.scenario).lanes, seed) for seed in seeds])
+    distill(dataset.transitions, stack, settings(kind, iterations), directory, seeds)
 
 
 def compare_scores(
@@ -395,8 +397,8 @@ def main() -> None:
                 "# Several seeds against d3rlpy",
                 "",
                 f"Seconds for {arguments.seeds} seeds of {arguments.iterations} updates on {os.cpu_count()} cores: "
-                "RAPID's a process each, all begun together, the start of the processes counted; d3rlpy's one after "
-                "another, `fit` alone.",
+                "RAPID's in stacks, a process for each core, begun together, the start of the processes counted; "
+                "d3rlpy's one after another, `fit` alone.",
                 "",
                 "| | batch | RAPID | d3rlpy | ratio |",
                 "|---|---|---|---|---|",

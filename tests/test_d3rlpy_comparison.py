@@ -76,12 +76,15 @@ def test_seeds_together_are_timed_against_fits_one_after_another(benchmark, tmp_
     monkeypatch.setitem(sys.modules, benchmark.__name__, benchmark)
     monkeypatch.setattr(benchmark, "KINDS", ("dqn",))
     dataset = Dataset("lane-3-density-2", fake_transitions(60), {})
-    (row,) = benchmark.compare_together(FakeWorker(), dataset, tmp_path, seeds=2, iterations=3)
-    assert asked == [("start", 0, None), ("fit", None, 3), ("start", 1, None), ("fit", None, 3)]
-    assert row["d3rlpy"] == 100
-    assert row["ratio"] == 100 / row["rapid"]
-    for seed in range(2):
-        last = (tmp_path / f"dqn-together-{seed}" / "metrics.jsonl").read_text().splitlines()[-1]
+    monkeypatch.setattr(benchmark.os, "cpu_count", lambda: 2)
+    (row,) = benchmark.compare_together(FakeWorker(), dataset, tmp_path, seeds=3, iterations=3)
+    assert asked == [("start", 0, None), ("fit", None, 3), ("start", 1, None), ("fit", None, 3), ("start", 2, None),
+                     ("fit", None, 3)]  # fmt: skip
+    assert row["d3rlpy"] == 150
+    assert row["ratio"] == 150 / row["rapid"]
+    # On two cores, the seeds 0 and 1 as one stack and seed 2 as another.
+    for first in (0, 2):
+        last = (tmp_path / f"dqn-stack-{first}" / "metrics.jsonl").read_text().splitlines()[-1]
         assert json.loads(last)["iteration"] == 3
 
 
