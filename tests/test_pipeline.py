@@ -7,9 +7,11 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 import rapid
 from rapid import pipeline
@@ -61,6 +63,24 @@ def test_a_run_leaves_agents_rows_and_a_page(finished: Path):
     assert "always-slower" in page
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert (finished / "figures" / "results.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("kind", ["mlp", "rapid"])
+def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, kind):
+    config = preset("strong", "tiny")
+    if kind == "mlp":
+        config = pipeline.baseline(config, "cql")
+    small = replace(config.distill, iterations=4, evaluate_every=2)
+    config = replace(config, distill=small, evaluate=replace(config.evaluate, curve_spawns=1))
+    homes = pipeline.distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2))
+    assert [home.name for home in homes] == ["seed-1", "seed-2"]
+    assert (tmp_path / "all" / "together" / "metrics.jsonl").exists() == (kind == "mlp")
+    for seed, home in zip((1, 2), homes, strict=True):
+        alone = pipeline.distill_agent(replace(config, seed=seed), finished / "mix", tmp_path / f"{seed}")
+        agent = rapid.load_agent(home / "agent")
+        assert agent.metadata["seed"] == seed
+        for name, weight in alone.network.state_dict().items():
+            torch.testing.assert_close(agent.network.state_dict()[name], weight, rtol=1e-3, atol=1e-5)
 
 
 def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(finished: Path):

@@ -31,6 +31,7 @@ from rapid.evaluation.summary import summary_text
 from rapid.files import read_json, sha256, write_json, write_text
 from rapid.networks.agent import QAgent, load_agent, save_agent
 from rapid.networks.q_network import QNetwork, build_network
+from rapid.networks.stack import stack_networks, unstack_networks
 from rapid.progress import format_seconds, task
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.reproduce import paper_numbers
@@ -43,7 +44,7 @@ from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import Teacher, check_teacher, make_teacher
 from rapid.teacher.models import is_present
 from rapid.tracking import Tracker, check_tracking
-from rapid.training.offline import distill
+from rapid.training.offline import distill, is_stackable
 from rapid.training.online import adapt
 from rapid.training.record import load_metrics
 
@@ -331,9 +332,41 @@ def baseline(config: Config, algorithm: Literal["dqn", "ddqn", "cql", "bc"]) -> 
 def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled") -> QAgent:
     """Train a policy offline on the dataset in `data`; the agent is written to ``out/agent``."""
     dataset = load_dataset(data)
-    network = build_network(
-        config.network, get_scenario(dataset.scenario).lanes, stream_seed(config.seed, "network")
-    ).to(config.device)
+    network = _new_network(config, dataset)
+    _distill_network(config, dataset, network, out, name, stream_seed(config.seed, "distill"))
+    _save_distilled(config, data, dataset, network, out, name)
+    return QAgent(network, name)
+
+
+def distill_seeds(config: Config, data: Path, out: Path, seeds: Sequence[int], name: str = "distilled") -> list[Path]:
+    """Train a policy of each seed on the dataset in `data`, and return their directories, ``out/seed-N``.
+
+    Where the networks can be stacked (:mod:`rapid.networks.stack`) they train together, recorded in ``out/together``;
+    others one after another.
+    """
+    homes = [out / f"seed-{seed}" for seed in seeds]
+    own = [replace(config, seed=seed) for seed in seeds]
+    if not is_stackable(config.network, config.distill):
+        for each, home in zip(own, homes, strict=True):
+            distill_agent(each, data, home, name)
+        return homes
+    dataset = load_dataset(data)
+    stack = stack_networks([_new_network(each, dataset) for each in own])
+    streams = [stream_seed(seed, "distill") for seed in seeds]
+    _distill_network(config, dataset, stack, out / "together", f"{name}, {len(homes)} seeds", streams)
+    for each, network, home in zip(own, unstack_networks(stack), homes, strict=True):
+        _save_distilled(each, data, dataset, network, home, name)
+    return homes
+
+
+def _new_network(config: Config, dataset: Dataset) -> QNetwork:
+    lanes = get_scenario(dataset.scenario).lanes
+    return build_network(config.network, lanes, stream_seed(config.seed, "network")).to(config.device)
+
+
+def _distill_network(
+    config: Config, dataset: Dataset, network: QNetwork, out: Path, name: str, seed: int | Sequence[int]
+) -> None:
     tracker = Tracker(config.tracking, out, f"distill-{name}".replace(" ", "-"), to_dict(without_place(config)))
     with tracker, task(f"distill, {name}", config.distill.iterations, "iterations") as work:
         distill(
@@ -341,15 +374,17 @@ def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled"
             network,
             config.distill,
             out,
-            seed=stream_seed(config.seed, "distill"),
+            seed=seed,
             evaluate=_curve(config, dataset.scenario, name),
             progress=work,
             teacher_share=dataset.teacher_share,
             track=tracker.log,
         )
+
+
+def _save_distilled(config: Config, data: Path, dataset: Dataset, network: QNetwork, out: Path, name: str) -> None:
     metadata = {"name": name, "phase": "distill", "data": str(data), "scenario": dataset.scenario, "seed": config.seed}
     save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
-    return QAgent(network, name)
 
 
 def _learnable(dataset: Dataset) -> Transitions:

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -79,6 +80,8 @@ def test_a_killed_stack_goes_on_where_it_was(tmp_path, monkeypatch):
     seen = []
     whole = train("whole", evaluate=lambda network, step: seen.append((network.members, step)) or {"return": 1.0})
     assert seen == [(1, 10)] * 3 + [(1, 20)] * 3
+    last = json.loads((tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()[-1])
+    assert last["evaluation"] == {f"member-{index}": {"return": 1.0} for index in range(3)}
     update = Learner.update
 
     def dying(self, batch):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rapid.config import DistillConfig, LossConfig
+from rapid.config import DistillConfig, LossConfig, NetworkConfig
 from rapid.data.replay import OfflineSampler
 from rapid.data.transitions import TEACHER, Transitions
 from rapid.errors import RapidError
@@ -104,8 +104,11 @@ def distill(
             continue
         row = {"iteration": done, **learner.means(), "learning_rate": learner.learning_rate, "seconds": record.seconds}
         if evaluate and measure and config.evaluate_every:
-            found = [evaluate(each, done) for each in ([network] if len(seeds) == 1 else unstack_networks(network))]
-            row["evaluation"] = found[0] if len(seeds) == 1 else found
+            if len(seeds) == 1:
+                row["evaluation"] = evaluate(network, done)
+            else:
+                members = enumerate(unstack_networks(network))
+                row["evaluation"] = {f"member-{index}": evaluate(member, done) for index, member in members}
         record.write(row)
         record.checkpoint(state, now=last)
         if progress:
@@ -114,15 +117,22 @@ def distill(
     return network
 
 
-def _check_members(network: QNetwork, seeds: Sequence[int], config: DistillConfig) -> None:
-    """Raise unless there is a seed for each member, and the loss of a stack is the mean of its members' losses.
+def is_stackable(network: NetworkConfig, config: DistillConfig) -> bool:
+    """Whether several such networks can be trained as one stack: the loss is then the mean of the members' losses.
 
-    The robust and the Munchausen term put two batches behind each other, which no stack can read.
+    The robust and the Munchausen term put two batches behind each other, which no stack can read; and how many of the
+    teacher's transitions are cloned differs between members.
     """
+    teacher_only = config.optimizer.algorithm == "bc" and config.loss.robust_on == "teacher"
+    concatenates = config.loss.robust_weight > 0 or config.loss.munchausen_weight > 0
+    return network.kind == "mlp" and not concatenates and not teacher_only
+
+
+def _check_members(network: QNetwork, seeds: Sequence[int], config: DistillConfig) -> None:
+    """Raise unless there is a seed for each member, and a stack can be trained like this."""
     if len(seeds) != network.members:
         raise RapidError(f"There are {len(seeds)} seeds for {network.members} networks. Give one for each.")
-    teacher_only = config.optimizer.algorithm == "bc" and config.loss.robust_on == "teacher"
-    if len(seeds) > 1 and (config.loss.robust_weight > 0 or config.loss.munchausen_weight > 0 or teacher_only):
+    if len(seeds) > 1 and not is_stackable(network.config, config):
         raise RapidError(
             "A stack of networks has no robust and no Munchausen term, and does not clone the teacher's transitions "
             "alone. Train each network by itself, or set loss.robust_weight and loss.munchausen_weight to 0 and "
