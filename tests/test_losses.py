@@ -262,3 +262,11 @@ def test_behavior_cloning_by_formula(batch):
     assert teacher.total.item() == pytest.approx(-log_probs[batch.teacher_B].mean().item(), rel=1e-5)
     nobody = batch._replace(teacher_B=torch.zeros(12, dtype=torch.bool))
     assert behavior_cloning_loss(network, nobody, teacher_only=True).total == 0
+
+
+def test_weights_of_a_cross_entropy_pick_rows():
+    q_BA, labels_BA = torch.randn(6, 5, generator=torch.Generator().manual_seed(0)), torch.eye(5)[[0, 1, 2, 3, 4, 0]]
+    chosen_B = torch.tensor([True, False, True, True, False, False])
+    weighted = cross_entropy(q_BA, labels_BA, 0.5, chosen_B.float())
+    torch.testing.assert_close(weighted, cross_entropy(q_BA[chosen_B], labels_BA[chosen_B], 0.5))
+    assert cross_entropy(q_BA, labels_BA, weights_B=torch.zeros(6)) == 0

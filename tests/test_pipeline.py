@@ -81,6 +81,13 @@ def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, ki
         assert agent.metadata["seed"] == seed
         for name, weight in alone.network.state_dict().items():
             torch.testing.assert_close(agent.network.state_dict()[name], weight, rtol=1e-3, atol=1e-5)
+    # The same command does nothing again; other ways of training do not write over it.
+    before = [(home / "agent" / "weights.safetensors").read_bytes() for home in homes]
+    assert pipeline.distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2)) == homes
+    other = preset("strong", "tiny") if kind == "mlp" else pipeline.baseline(preset("strong", "tiny"), "cql")
+    with pytest.raises(RapidError, match="Choose another --out"):
+        pipeline.distill_seeds(other, finished / "mix", tmp_path / "all", (1, 2))
+    assert [(home / "agent" / "weights.safetensors").read_bytes() for home in homes] == before
 
 
 def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(finished: Path):

@@ -109,7 +109,7 @@ def _q_values(graph: Graph, network: QNetwork) -> str:
     if encoding.mask_absent:
         present = graph.node("Greater", graph.cut("obs", 0, 1, 2), _array(encoding.absent_V1))
     if not isinstance(head, TokenHead):
-        assert isinstance(head, MlpHead), "a stack is no agent"
+        assert isinstance(head, MlpHead)  # agents are never stacks
         if present:
             features = graph.node("Where", present, features, 0.0)
         return _mlps(graph, head, features, read_GF)

@@ -46,7 +46,7 @@ from rapid.teacher.models import is_present
 from rapid.tracking import Tracker, check_tracking
 from rapid.training.offline import distill, is_stackable
 from rapid.training.online import adapt
-from rapid.training.record import load_metrics
+from rapid.training.record import CHECKPOINT_FILE, load_metrics
 
 STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
 FLOORS = ("slower", "idle", "random", "rule")
@@ -144,7 +144,7 @@ def check(config: Config) -> None:
         torch.empty(0, device=config.device)
     except (RuntimeError, AssertionError) as error:
         raise RapidError(
-            f"Device '{config.device}' cannot be used: {str(error).splitlines()[0]} Use --device cpu."
+            f"Device '{config.device}' cannot be used: {str(error).splitlines()[0].rstrip('.')}. Use --device cpu."
         ) from error
     lanes = get_scenario(config.scenario).lanes
     for name in config.evaluate.attacks:
@@ -343,17 +343,27 @@ def distill_seeds(config: Config, data: Path, out: Path, seeds: Sequence[int], n
 
     Where the networks can be stacked (:mod:`rapid.networks.stack`) they train together, recorded in ``out/together``;
     others one after another.
+
+    Raises:
+        RapidError: a directory holds what was not trained like this, or anything that `distill` refuses.
     """
     homes = [out / f"seed-{seed}" for seed in seeds]
     own = [replace(config, seed=seed) for seed in seeds]
-    if not is_stackable(config.network, config.distill):
+    together, stacked = out / "together", is_stackable(config.network, config.distill)
+    for home in homes:
+        alone = (home / CHECKPOINT_FILE).exists()
+        if (alone and stacked) or (not alone and (home / "agent").exists() and not together.exists()):
+            raise RapidError(f"'{home}' holds an agent that was trained otherwise. Choose another --out.")
+    if not stacked:
+        if together.exists():
+            raise RapidError(f"'{together}' holds seeds that were trained together. Choose another --out.")
         for each, home in zip(own, homes, strict=True):
             distill_agent(each, data, home, name)
         return homes
     dataset = load_dataset(data)
     stack = stack_networks([_new_network(each, dataset) for each in own])
     streams = [stream_seed(seed, "distill") for seed in seeds]
-    _distill_network(config, dataset, stack, out / "together", f"{name}, {len(homes)} seeds", streams)
+    _distill_network(config, dataset, stack, together, f"{name} {len(homes)} seeds", streams)
     for each, network, home in zip(own, unstack_networks(stack), homes, strict=True):
         _save_distilled(each, data, dataset, network, home, name)
     return homes

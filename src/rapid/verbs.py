@@ -133,8 +133,9 @@ class Distill:
     seed: int = Config.seed
     """Decides the weights, the batches and the inner attack."""
     seeds: int = 1
-    """Train this many agents, of the seeds from --seed on, each in a directory of its own under --out. Baselines (kind
-    mlp, no robust term) train together as one stack, in less than half the time."""
+    """Train this many agents, of the seeds from --seed on, into OUT/seed-N. Baselines (kind mlp, neither robust nor
+    Munchausen term) train together as one stack in less than half the time, with one record for all in OUT/together;
+    others one after another, where a process for each seed is faster."""
     device: str = Config.device
     """Torch device; on a CUDA device a gradient step is recorded once and replayed."""
     source: Flat[Source] = field(default_factory=Source)

@@ -1,18 +1,17 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from fake_worlds import fake_transitions
-from rapid.config import DistillConfig, LossConfig, NetworkConfig, OptimizerConfig
+from rapid.config import AdaptConfig, DistillConfig, LossConfig, NetworkConfig, OptimizerConfig
 from rapid.data.transitions import RANDOM, concatenate
 from rapid.errors import RapidError
-from rapid.networks.agent import save_agent
+from rapid.networks.agent import QAgent, save_agent
 from rapid.networks.q_network import build_network, set_phase
 from rapid.networks.stack import stack_networks, unstack_networks
-from rapid.training import distill, offline
+from rapid.training import adapt, distill, offline
 from rapid.training.adam import clip_norm
 from rapid.training.learner import Learner
 
@@ -35,6 +34,12 @@ def test_every_member_reads_its_own_part(roads):
     assert networks()[0].members == 1
 
 
+def test_stacking_leaves_the_global_random_stream():
+    before = torch.get_rng_state()
+    unstack_networks(stack_networks(networks()))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_unstacked_networks_are_those_that_were_stacked():
     for before, after in zip(networks(), unstack_networks(stack_networks(networks())), strict=True):
         weights = after.state_dict()
@@ -48,14 +53,17 @@ LOSSES = {
 }
 
 
-@pytest.mark.parametrize("kind", LOSSES)
-@pytest.mark.parametrize("clip", [0.0, 0.5])
-def test_a_stack_learns_what_its_members_learn_alone(tmp_path, kind, clip):
-    optimizer = OptimizerConfig(batch_size=8, max_grad_norm=clip)
-    config = DistillConfig(iterations=25, evaluate_every=0, loss=LOSSES[kind], optimizer=optimizer)
-    stack = distill(DATA, stack_networks(networks()), config, tmp_path / "stack", SEEDS)
+@pytest.mark.parametrize("kind", [*LOSSES, "bc"])
+@pytest.mark.parametrize(("clip", "teacher_share"), [(0.0, None), (0.5, 0.25)])
+def test_a_stack_learns_what_its_members_learn_alone(tmp_path, kind, clip, teacher_share):
+    algorithm = "bc" if kind == "bc" else "dqn"
+    optimizer = OptimizerConfig(batch_size=8, max_grad_norm=clip, algorithm=algorithm)
+    loss = LOSSES.get(kind, PLAIN)
+    config = DistillConfig(iterations=25, evaluate_every=0, loss=loss, optimizer=optimizer)
+    stack, share = stack_networks(networks()), {"teacher_share": teacher_share}
+    distill(DATA, stack, config, tmp_path / "stack", SEEDS, **share)
     for seed, alone, together in zip(SEEDS, networks(), unstack_networks(stack), strict=True):
-        distill(DATA, alone, config, tmp_path / f"{seed}", seed)
+        distill(DATA, alone, config, tmp_path / f"{seed}", seed, **share)
         weights = together.state_dict()
         for name, weight in alone.state_dict().items():
             # Sums in another order differ in the last bits, which Adam's division makes larger.
@@ -121,8 +129,13 @@ def test_what_cannot_be_stacked_is_refused(tmp_path):
         distill(
             DATA, stack, replace(config, loss=replace(PLAIN, robust_on="teacher"), optimizer=cloning), tmp_path, SEEDS
         )
-    with pytest.raises(RapidError, match="several agents"):
-        save_agent(tmp_path / "agent", stack, {})
+    for other in (stack, stack_networks(networks()[:1])):
+        with pytest.raises(RapidError, match="several agents"):
+            save_agent(tmp_path / "agent", other, {})
+        with pytest.raises(RapidError, match="several agents"):
+            QAgent(other)
+        with pytest.raises(RapidError, match="cannot drive"):
+            adapt(other, AdaptConfig(train="all"), "lane-3-density-2", tmp_path, 0)
     with pytest.raises(RapidError, match="trains every weight"):
         set_phase(stack, "adapt")
-    assert np.array_equal(list(tmp_path.iterdir()), [])
+    assert not list(tmp_path.iterdir())

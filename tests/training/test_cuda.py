@@ -110,7 +110,7 @@ def test_a_frozen_policy_stays_bit_equal_while_the_adapter_learns(transitions):
 
 @pytest.mark.parametrize("stop", [2, WARM_UP + 20])
 def test_resumed_equals_uninterrupted(transitions, tmp_path, monkeypatch, stop):
-    monkeypatch.setattr(offline, "LOG_EVERY", 5)
+    monkeypatch.setattr(offline, "LOG_EVERY", 1)
     config = replace(STRONG.distill, iterations=40, evaluate_every=0)
 
     def train(home: str) -> dict[str, torch.Tensor]:

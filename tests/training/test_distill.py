@@ -201,3 +201,10 @@ def test_the_target_follows_at_its_rate_and_pace(rate, every):
         for old, new, online in pairs:
             expected = old.lerp(online, rate) if step % every == 0 else old
             torch.testing.assert_close(new, expected, rtol=0, atol=0 if rate == 1 or step % every else 1e-7)
+
+
+def test_a_checkpoint_of_another_kind_of_device_is_refused():
+    learner = Learner(network(), CONFIG.optimizer, LOSS, 1, torch.Generator())
+    state = learner.state_dict() | {"generator": torch.zeros(16, dtype=torch.uint8)}
+    with pytest.raises(RapidError, match="--device that the training began"):
+        learner.load_state_dict(state)

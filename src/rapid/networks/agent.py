@@ -45,9 +45,14 @@ class QAgent:
         network: the network; it is used as it is, not copied.
         name: the name shown in tables.
         metadata: what was saved with the network.
+
+    Raises:
+        RapidError: the network is a stack of several.
     """
 
     def __init__(self, network: QNetwork, name: str = "agent", metadata: dict[str, Any] | None = None) -> None:
+        if network.is_stack:
+            raise RapidError("A stack is several agents. Take one of those that `unstack_networks` returns.")
         self.network, self.name, self.metadata = network, name, metadata or {}
 
     def act(self, obs_BVF: np.ndarray) -> np.ndarray:
@@ -111,8 +116,8 @@ def save_agent(directory: str | os.PathLike[str], network: QNetwork, metadata: d
     Raises:
         RapidError: the directory cannot be written, or `network` is a stack.
     """
-    if network.members > 1:
-        raise RapidError("A stack holds several agents. Save each of those that `unstack_networks` returns.")
+    if network.is_stack:
+        raise RapidError("A stack is several agents. Save each of those that `unstack_networks` returns.")
     folder = Path(directory)
     # A clone each, since safetensors refuses tensors that share memory.
     weights = {key: value.detach().cpu().contiguous().clone() for key, value in network.state_dict().items()}

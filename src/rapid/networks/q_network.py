@@ -90,8 +90,13 @@ class QNetwork(nn.Module):
         self.head = TokenHead(config) if config.kind in ("rapid", "attentive") else MlpHead(config)
 
     @property
+    def is_stack(self) -> bool:
+        """Whether this is several networks as one (:mod:`rapid.networks.stack`), each with its part of a batch."""
+        return isinstance(self.head, MlpStack)
+
+    @property
     def members(self) -> int:
-        """How many networks this is: 1 unless it is a stack (:mod:`rapid.networks.stack`)."""
+        """How many networks this is: 1 unless it is a stack."""
         return self.head.members if isinstance(self.head, MlpStack) else 1
 
     @property

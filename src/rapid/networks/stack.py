@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from rapid.errors import RapidError
 from rapid.networks.mlp import MlpHead, MlpStack
-from rapid.networks.q_network import QNetwork
+from rapid.networks.q_network import QNetwork, build_network
 
 
 def stack_networks(networks: Sequence[QNetwork]) -> QNetwork:
@@ -25,7 +25,7 @@ def stack_networks(networks: Sequence[QNetwork]) -> QNetwork:
             f"Networks of kind '{first.config.kind}' cannot be stacked, only of kind 'mlp'. Train each in a process of "
             "its own."
         )
-    stack = QNetwork(first.config, first.lanes)
+    stack = build_network(first.config, first.lanes, 0)
     stack.head = MlpStack(heads)
     return stack.to(first.scale_F.device)
 
@@ -40,7 +40,7 @@ def unstack_networks(stack: QNetwork) -> list[QNetwork]:
         raise RapidError("This network is no stack. Give what `stack_networks` returned.")
     found: list[QNetwork] = []
     for member in range(stack.members):
-        network = QNetwork(stack.config, stack.lanes).to(stack.scale_F.device)
+        network = build_network(stack.config, stack.lanes, 0).to(stack.scale_F.device)
         assert isinstance(network.head, MlpHead)
         stack.head.copy_to(network.head, member)
         found.append(network)

@@ -1,7 +1,8 @@
 """A gradient step recorded once as a CUDA graph and then replayed.
 
 RAPID's networks are so small that a GPU spends an update waiting for Python to launch the next of some thousand
-kernels. A recorded update is launched as one. It computes the same: the same kernels on the same numbers.
+kernels. A recorded update is launched as one. It computes the same, and a little in vain: a recording cannot look
+whether an adapter's gate is open, so it runs every adapter, also those that an unrecorded step leaves out.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ WARM_UP = 3
 
 
 class CapturedStep:
-    """Calls `step`, from the third call on as one graph.
+    """Calls `step`; after `WARM_UP` calls as one graph.
 
     `step` must do the same whatever the numbers are: ask for no value, and read everything that changes from tensors
     that stay where they are. A batch of other shapes than the recorded one is computed without the graph.
@@ -36,10 +37,14 @@ class CapturedStep:
 
     def __call__(self, batch: TransitionBatch) -> Tensor:
         """Take the step and return what it returns, as a tensor of its own."""
+        with torch.cuda.device(self._generator.device):
+            return self._on_device(batch)
+
+    def _on_device(self, batch: TransitionBatch) -> Tensor:
         self._calls += 1
         if self._calls <= WARM_UP:
             # What is recorded later runs on a stream of its own, so its kernels are loaded on one.
-            stream = torch.cuda.Stream(self._generator.device)
+            stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
                 result = self._step(batch)
@@ -64,7 +69,8 @@ class CapturedStep:
         self._given = TransitionBatch(*copies)
         self._graph = torch.cuda.CUDAGraph()
         self._graph.register_generator_state(self._generator)
-        with torch.cuda.graph(self._graph):
+        # A stream of this device: torch's usual one for recordings belongs to the first device that recorded.
+        with torch.cuda.graph(self._graph, stream=torch.cuda.Stream()):
             self._result = self._step(self._given)
 
 

@@ -23,7 +23,8 @@ class Learner:
     """Trains the parameters of `network` that require a gradient; everything else stays as it is, bit for bit.
 
     Args:
-        network: is trained in place. A stack's members learn as they would alone, each from its part of every batch.
+        network: is trained in place. A stack's members learn as they would alone, each from its part of every batch,
+            with a loss that :func:`rapid.training.offline.is_stackable` allows.
         config: the optimiser.
         loss: the loss.
         updates: gradient steps that are planned; the step size falls to zero over them if `config.linear_decay`.
@@ -131,7 +132,16 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Become as the learner was whose `state_dict` this is."""
+        """Become as the learner was whose `state_dict` this is.
+
+        Raises:
+            RapidError: it was on another kind of device, whose random numbers go on elsewhere.
+        """
+        if len(state["generator"]) != len(self.generator.get_state()):
+            raise RapidError(
+                "The checkpoint was made on another kind of device. Go on with the --device that the training began "
+                "with, or train in another directory."
+            )
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])
         self._adam.load_state_dict(state["optimizer"])

@@ -59,6 +59,8 @@ def adapt(
         RapidError: settings that do not fit the data, a loss that is not finite (the last good checkpoint stays), or a
             directory of another training.
     """
+    if network.is_stack:
+        raise RapidError("A stack of networks cannot drive. Adapt one network at a time.")
     offline_count = _check(config, offline)
     device = str(next(network.parameters()).device)
     record = Record(
