@@ -7,8 +7,9 @@ printed), then all of them over the test spawns, clean and attacked. With `--dat
 the data of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted
 call goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there:
 `scores.parquet` (raw rows) and `scores.md`; `scores-paper` for the recipe `paper`, with the paper's numbers beside
-ours, and `scores-progress` for the reward `progress`. Of the floors and the planner it shows the rows in
-`floors.parquet`, which drove the same spawns.
+ours, `scores-progress` for the reward `progress`, `scores-2000` over so many spawns. Of the floors and the planner it
+shows the rows in `floors.parquet`, where they drove the same spawns. With `--more-data` the default teacher, which
+needs its model, collects four times what is shipped, and RAPID and CQL learn from that for four times as long.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -42,7 +43,7 @@ from rapid.report.data import paper_return
 from rapid.runs import commit
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 from rapid.settings import apply_overrides, to_dict
-from rapid.spawns import spawn_seeds
+from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import make_teacher
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
@@ -53,32 +54,69 @@ MLP_DISCOUNT = 0.93
 """Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
 RULE_DATA = "distilled, rule data"
 """RAPID distilled from the data of a rule in place of the teacher's, where such data is shipped."""
+MORE_DATA = 60_000
+"""Transitions of the teacher, and as many random ones, that `--more-data` collects: four times the shipped ones."""
+MORE_ITERATIONS = 16_000
+"""Gradient steps on them."""
+SHOWN_SPAWNS = 200
+"""Spawns of the tables that are named without their number."""
+Source = Literal["teacher", "rule", "collected"]
+"""Whose data is mixed with a random driver's: the shipped sets of the teacher or the rule, or more of the teacher."""
 WAY = {3: 0.75, 4: 0.70, 5: 0.50}
 """The share of the way from always-slower to the planner that is aimed at, by lanes; on either reward."""
 
 
-def offline_recipes(config: Config) -> dict[str, Config]:
-    """Return the settings of every agent that is trained offline, by name."""
+class Distillation(NamedTuple):
+    """How an agent is trained offline."""
+
+    settings: Config
+    source: Source = "teacher"
+
+
+def offline_recipes(config: Config) -> dict[str, Distillation]:
+    """Return how every agent is trained offline, by name."""
     return {
-        "distilled": config,
-        "offline DQN": pipeline.baseline(config, "dqn"),
-        "offline DDQN": pipeline.baseline(config, "ddqn"),
-        "CQL": pipeline.baseline(config, "cql"),
-        "behaviour cloning": pipeline.baseline(config, "bc"),
+        "distilled": Distillation(config),
+        "offline DQN": Distillation(pipeline.baseline(config, "dqn")),
+        "offline DDQN": Distillation(pipeline.baseline(config, "ddqn")),
+        "CQL": Distillation(pipeline.baseline(config, "cql")),
+        "behaviour cloning": Distillation(pipeline.baseline(config, "bc")),
     }
 
 
-def offline_ablations(config: Config) -> dict[str, Config]:
-    """Return the settings of RAPID distilled without one of its parts, by name."""
-
-    def without(**terms: float) -> Config:
-        return replace(config, distill=replace(config.distill, loss=replace(config.distill.loss, **terms)))
-
-    return {
-        "distilled, no J_robust": without(robust_weight=0.0),
-        "distilled, no CQL": without(conservative_weight=0.0),
-        "distilled, plain DQN": without(robust_weight=0.0, conservative_weight=0.0),
+def offline_ablations(config: Config, data: str) -> dict[str, Distillation]:
+    """Return how RAPID is distilled without one of its parts, by name."""
+    found = {
+        "distilled, no J_robust": Distillation(without(config, robust_weight=0.0)),
+        "distilled, no CQL": Distillation(without(config, conservative_weight=0.0)),
+        "distilled, plain DQN": Distillation(without(config, robust_weight=0.0, conservative_weight=0.0)),
     }
+    if f"{get_scenario(data).name}/rule" in shipped_sets():
+        found[RULE_DATA] = Distillation(config, "rule")
+    return found
+
+
+def offline_with_more_data(config: Config) -> dict[str, Distillation]:
+    """Return how agents are trained offline on the data that is collected, by name."""
+    sizes = {"teacher_transitions": MORE_DATA, "random_transitions": MORE_DATA}
+    share = max(config.mix.p, 1 - config.mix.p)
+    more = replace(
+        config,
+        collect=replace(config.collect, **sizes),
+        mix=replace(config.mix, size=int(MORE_DATA / share)),
+        distill=replace(config.distill, iterations=MORE_ITERATIONS),
+    )
+    of = short(MORE_DATA)
+    return {
+        f"distilled, {of}": Distillation(more, "collected"),
+        f"distilled, {of}, no J_robust": Distillation(without(more, robust_weight=0.0), "collected"),
+        f"CQL, {of}": Distillation(pipeline.baseline(more, "cql"), "collected"),
+    }
+
+
+def without(config: Config, **terms: float) -> Config:
+    """Return the settings with other weights of the terms of the offline loss."""
+    return replace(config, distill=replace(config.distill, loss=replace(config.distill.loss, **terms)))
 
 
 class Adaptation(NamedTuple):
@@ -131,6 +169,7 @@ def train(
     budgets: Iterable[int],
     ablations: bool = False,
     only: Sequence[str] = (),
+    more_data: bool = False,
 ) -> list[tuple[str, Path]]:
     """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
 
@@ -142,13 +181,16 @@ def train(
         budgets: online steps; each gives agents of its own.
         ablations: whether RAPID is trained without each of its parts as well.
         only: names of the agents wanted; none are all of them.
+        more_data: whether agents are trained on data that is collected first as well.
 
     Raises:
         RapidError: an agent of `only` does not exist, or one was trained with other settings.
     """
-    offline = offline_recipes(config) | (offline_ablations(config) if ablations else {})
-    if ablations and f"{get_scenario(data).name}/rule" in shipped_sets():
-        offline[RULE_DATA] = config
+    offline = offline_recipes(config)
+    if ablations:
+        offline |= offline_ablations(config, data)
+    if more_data:
+        offline |= offline_with_more_data(config)
     online: dict[str, Adaptation] = {}
     for steps in budgets:
         online |= online_recipes(config, scenario, steps, ablations)
@@ -157,15 +199,13 @@ def train(
         if name not in offline and name not in online:
             names = ", ".join(f"'{name}'" for name in (*offline, *online))
             raise RapidError(f"There is no agent '{name}' among {names}. Choose others, or other --steps.")
-    mixture = mixed(config, data, work)
     agents: list[tuple[str, Path]] = []
     origins = {online[name].origin for name in wanted if name in online}
-    for name, settings in offline.items():
+    for name, (settings, source) in offline.items():
         home = work / file_name(name)
         if name in wanted or name in origins:
             if not is_trained(home, settings, "distill"):
-                learned_from = mixed(config, data, work, "rule") if name == RULE_DATA else mixture
-                pipeline.distill_agent(settings, learned_from, home, name)
+                pipeline.distill_agent(settings, mixed(settings, data, work, source), home, name)
             if name in wanted:
                 agents.append((name, home / "agent"))
     for name, (settings, origin, with_data) in online.items():
@@ -173,7 +213,7 @@ def train(
         if name in wanted:
             if not is_trained(home, own, "adapt"):
                 start = work / file_name(origin) / "agent"
-                pipeline.adapt_agent(own, start, mixture if with_data else None, home, name)
+                pipeline.adapt_agent(own, start, mixed(config, data, work) if with_data else None, home, name)
             agents.append((name, home / "agent"))
     return agents
 
@@ -229,24 +269,30 @@ def flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
     return found
 
 
-def mixed(config: Config, scenario: str, work: Path, driver: str = "teacher") -> Path:
-    """Return where a driver's data of a scenario lies mixed with random data; it is mixed if it is not there."""
-    mixture = work / ("mix" if driver == "teacher" else f"mix-{driver}")
+def mixed(config: Config, scenario: str, work: Path, source: Source = "teacher") -> Path:
+    """Return where the data of a scenario lies mixed with random data; it is mixed if it is not there."""
+    mixture = work / ("mix" if source == "teacher" else f"mix-{source}")
     if not (mixture / "dataset.json").exists():
         work.mkdir(parents=True, exist_ok=True)
-        pipeline.mix_datasets(config, *datasets(scenario, work.parent, driver), mixture)
+        pipeline.mix_datasets(config, *datasets(config, scenario, work.parent, source), mixture)
     return mixture
 
 
-def datasets(scenario: str, work: Path, driver: str = "teacher") -> tuple[Path, Path]:
-    """Return where the data of a driver and of the random one lie; under `work` if the reward is not the shipped."""
+def datasets(config: Config, scenario: str, work: Path, source: Source) -> tuple[Path, Path]:
+    """Return where a driver's data and the random one lie; under `work` if it is collected, or of another reward."""
     driven = replace(get_scenario(scenario), reward="normalized").name
+    drivers: tuple[TrainPart, TrainPart] = ("teacher", "random")
     folders: list[Path] = []
-    for name in (driver, "random"):
-        shipped = f"shipped:{driven}/{name}"
-        folder = dataset_folder(shipped) if driven == scenario else work / name
-        if not (folder / "dataset.json").exists():
-            save_dataset(relabel(load_dataset(shipped), get_scenario(scenario).reward), folder)
+    for driver in drivers:
+        if source == "collected":
+            folder = work / "collected" / driver
+            pipeline.collect_transitions(replace(config, scenario=driven), folder, driver)
+        else:
+            folder = dataset_folder(f"shipped:{driven}/{source if driver == 'teacher' else driver}")
+        if driven != scenario:
+            dataset, folder = load_dataset(folder), work / "relabelled" / source / driver
+            if not (folder / "dataset.json").exists():
+                save_dataset(relabel(dataset, get_scenario(scenario).reward), folder)
         folders.append(folder)
     return folders[0], folders[1]
 
@@ -261,7 +307,9 @@ def file_name(name: str) -> str:
     return name.replace(" ", "-").replace(",", "")
 
 
-def measure(config: Config, agents: Iterable[tuple[str, Path]], work: Path, scenario: str, spawns: int) -> None:
+def measure(
+    config: Config, agents: Iterable[tuple[str, Path]], work: Path, scenario: str, spawns: int, attacks: Sequence[str]
+) -> None:
     """Drive every agent that has not been driven."""
     for name, directory in agents:
         path = work / "rows" / f"{scenario}-{spawns}-{file_name(name)}.parquet"
@@ -269,12 +317,12 @@ def measure(config: Config, agents: Iterable[tuple[str, Path]], work: Path, scen
             continue
         agent = open_agent(str(directory), scenario, config.seed)
         agent.name = name
-        with task(f"evaluate, {name}, {scenario}, seed {config.seed}", spawns * len(ATTACKS), "episodes") as shown_:
+        with task(f"evaluate, {name}, {scenario}, seed {config.seed}", spawns * len(attacks), "episodes") as shown_:
             rows = evaluate_agent(
                 agent,
                 scenario,
                 spawn_seeds("test", spawns),
-                ATTACKS,
+                attacks,
                 generator_seed=config.seed,
                 training_seed=config.seed,
                 commit=commit(),
@@ -313,11 +361,18 @@ def shown(number: Estimate, digits: int = 2) -> str:
     return f"{number.value:.{digits}f} [{number.low:.{digits}f}, {number.high:.{digits}f}]"
 
 
-def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> str:
+def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, command: str) -> str:
     """Return the tables as Markdown."""
     mlps = f"Online DDQN has no Munchausen term, and no MLP a discount above {MLP_DISCOUNT}. "
     if config.recipe == "paper":
         mlps = "Step, batch and target updates of the baselines as the paper prints them. "
+    of = f", {short(MORE_DATA)}"
+    more = (
+        f"After the name of an offline method, `{of[2:]}` says that it learned from {MORE_DATA} transitions of the "
+        f"teacher and as many random ones in {MORE_ITERATIONS} gradient steps. "
+        if any(of in row.agent for row in rows)
+        else ""
+    )
     commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for row in rows))
     lines = [
         "# Scores",
@@ -325,8 +380,9 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        f"{differing(config.recipe)}{mlps}"
-        "Last checkpoint, test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and spawns).",
+        f"{differing(config.recipe)}{mlps}{more}"
+        f"Last checkpoint, {spawns} test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and "
+        "spawns).",
         "",
         f"Made with `{command}`; the rows are of the commits {commits}.",
     ]
@@ -341,7 +397,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
             lines += beside_paper(here, scenario)
         teacher = next((name for name, of in clean.items() if of and of[0].kind == "teacher"), None)
         adapted = [name for name in clean if name.startswith("RAPID")]
-        pairs = [("distilled", "slower"), ("distilled", teacher)]
+        distilled = [name for name in clean if name == "distilled" or name.startswith(f"distilled{of}")]
+        pairs = [(name, other) for name in distilled for other in ("slower", teacher)]
         for name in adapted:
             pairs += [
                 (name, "slower"),
@@ -359,7 +416,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, command: str) -> s
                 lines.append(f"- {name} against {other}, paired: return {shown(gain)}, crash share {shown(crash, 3)}.")
         if {"slower", "planner"} <= clean.keys():
             low, high = (float(np.mean(column(clean[name], "episode_return"))) for name in ("slower", "planner"))
-            for name in ["distilled", *adapted]:
+            for name in [*distilled, *adapted]:
                 if name in clean:
                     reached = (float(np.mean(column(clean[name], "episode_return"))) - low) / (high - low)
                     aim = f"; aimed at: {WAY.get(get_scenario(scenario).lanes, 0):.0%} within a million online steps"
@@ -388,6 +445,8 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     """Write what has been measured so far."""
     seeds = set(spawn_seeds("test", spawns))
     floors = [row for row in load_rows(out / "floors.parquet") if row.agent in FLOORS and row.seed in seeds]
+    # On more spawns than they drove they would be compared with others' driving elsewhere.
+    floors = floors if {row.seed for row in floors} == seeds else []
     rows: list[EpisodeRow] = []
     own: list[EpisodeRow] = []
     for scenario in scenarios:
@@ -401,11 +460,12 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     marks = {
         "paper": config.recipe == "paper",
         "progress": all(get_scenario(s).reward == "progress" for s in scenarios),
+        f"{spawns}": spawns != SHOWN_SPAWNS,
     }
     name = "-".join(["scores", *(mark for mark, it_is in marks.items() if it_is), *(["from", data] if data else [])])
     save_rows(out / f"{name}.parquet", own)
     command = shlex.join(["python", "benchmarks/scores.py", *sys.argv[1:]])
-    write_text(out / f"{name}.md", report(rows, config, data, command))
+    write_text(out / f"{name}.md", report(rows, config, data, spawns, command))
     print(f"Wrote {out / name}.md")
 
 
@@ -413,7 +473,8 @@ def main() -> None:
     """Train, measure, and write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2, 3, 4], help="training seeds")
-    parser.add_argument("--spawns", type=int, default=200, help="test spawns per agent")
+    parser.add_argument("--spawns", type=int, default=SHOWN_SPAWNS, help="test spawns per agent")
+    parser.add_argument("--attacks", nargs="+", default=list(ATTACKS), choices=ATTACKS, help="attacks to drive under")
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER_SCENARIOS), help="target scenarios")
     parser.add_argument("--recipe", default="strong", choices=("strong", "paper"), help="how things are trained")
     parser.add_argument(
@@ -423,6 +484,11 @@ def main() -> None:
         "--ablations",
         action="store_true",
         help="train RAPID without each of its parts, and from a rule's data, as well",
+    )
+    parser.add_argument(
+        "--more-data",
+        action="store_true",
+        help=f"collect {MORE_DATA} transitions of the teacher, and train RAPID and CQL on them as well",
     )
     parser.add_argument("--device", default="cpu", help="where agents are trained; they drive on the CPU")
     parser.add_argument("--only", nargs="+", default=[], help="agents to train and drive, by their names in the table")
@@ -443,8 +509,8 @@ def main() -> None:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
                 own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
-                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations, chosen.only)
-                measure(own, agents, home, scenario, chosen.spawns)
+                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations, chosen.only, chosen.more_data)
+                measure(own, agents, home, scenario, chosen.spawns, chosen.attacks)
     table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)
 
 

@@ -104,7 +104,7 @@ def test_only_what_is_wanted_and_what_it_starts_from_is_trained(benchmark, confi
 
 def test_the_rules_data_takes_the_teachers_place(benchmark, config, tmp_path, asked, monkeypatch):
     mixed, learned = [], {}
-    monkeypatch.setattr(benchmark, "datasets", lambda _, work, driver: (work / driver, work / "random"))
+    monkeypatch.setattr(benchmark, "datasets", lambda config, data, work, source: (work / source, work / "random"))
     monkeypatch.setattr(benchmark.pipeline, "mix_datasets", lambda _, driver, random, out: mixed.append(driver.name))
     monkeypatch.setattr(benchmark.pipeline, "distill_agent", lambda _, data, out, name: learned.update({name: data}))
     names = ["distilled", benchmark.RULE_DATA]
@@ -116,7 +116,40 @@ def test_the_rules_data_takes_the_teachers_place(benchmark, config, tmp_path, as
         benchmark.train(config, "lane-4-density-2", work, "lane-4-density-2", (), ablations=True, only=names)
 
 
-def test_each_recipe_and_reward_has_a_table_of_its_own(benchmark, config, tmp_path):
+def test_more_data_is_collected_first_and_learned_from_by_rapid_and_cql(benchmark, config, tmp_path, monkeypatch):
+    collected, mixed, learned = [], [], {}
+    monkeypatch.setattr(
+        benchmark.pipeline,
+        "collect_transitions",
+        lambda config, out, driver: collected.append((driver, out, config.collect, config.scenario)),
+    )
+    monkeypatch.setattr(
+        benchmark.pipeline, "mix_datasets", lambda config, *folders: mixed.append((config.mix.size, *folders))
+    )
+    monkeypatch.setattr(
+        benchmark.pipeline,
+        "distill_agent",
+        lambda config, data, out, name: learned.update({name: (config.distill, data)}),
+    )
+    scenario, work = "lane-4-density-2.5", tmp_path / "seed-0"
+    names = ["distilled, 60K", "distilled, 60K, no J_robust", "CQL, 60K"]
+    agents = benchmark.train(config, scenario, work, scenario, (), only=names, more_data=True)
+    assert [name for name, _ in agents] == list(learned) == names
+    teacher, random = tmp_path / "collected" / "teacher", tmp_path / "collected" / "random"
+    assert {(driver, out) for driver, out, *_ in collected} == {("teacher", teacher), ("random", random)}
+    assert {(c.teacher_transitions, c.random_transitions) for _, _, c, _ in collected} == {(60_000, 60_000)}
+    assert {where for *_, where in collected} == {scenario}
+    assert set(mixed) == {(120_000, teacher, random, work / "mix-collected")}
+    assert {data for _, data in learned.values()} == {work / "mix-collected"}
+    assert {settings.iterations for settings, _ in learned.values()} == {4 * config.distill.iterations}
+    whole, part = (learned[name][0] for name in names[:2])
+    assert whole == replace(part, loss=config.distill.loss)
+    assert part.loss.robust_weight == 0
+    with pytest.raises(RapidError, match="no agent 'distilled, 60K'"):
+        benchmark.train(config, scenario, work, scenario, (), only=names)
+
+
+def test_each_recipe_and_reward_has_a_table_of_its_own(benchmark, config, tmp_path, monkeypatch):
     for scenario in ("lane-3-density-2", "lane-3-density-2:progress"):
         rows = [
             replace(row, agent="distilled", commit="c0ffee00") for row in run_episodes(SCRIPTED, scenario, [0]).rows(0)
@@ -125,7 +158,11 @@ def test_each_recipe_and_reward_has_a_table_of_its_own(benchmark, config, tmp_pa
         benchmark.save_rows(path, rows)
         benchmark.save_rows(tmp_path / "floors.parquet", rows)
         benchmark.table(tmp_path, [scenario], "", 1, config, tmp_path)
-    assert {path.name for path in tmp_path.glob("scores*.md")} == {"scores.md", "scores-progress.md"}
+    assert {path.stem for path in tmp_path.glob("scores*.md")} == {"scores-1", "scores-progress-1"}
+    monkeypatch.setattr(benchmark, "SHOWN_SPAWNS", 1)
+    for scenario in ("lane-3-density-2", "lane-3-density-2:progress"):
+        benchmark.table(tmp_path, [scenario], "", 1, config, tmp_path)
+    assert {path.stem for path in tmp_path.glob("scores*.md")} >= {"scores", "scores-progress"}
     assert "the commits c0ffee0." in (tmp_path / "scores.md").read_text()
 
 
