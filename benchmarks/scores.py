@@ -286,7 +286,9 @@ def datasets(config: Config, scenario: str, work: Path, source: Source) -> tuple
     for driver in drivers:
         if source == "collected":
             folder = work / "collected" / driver
-            pipeline.collect_transitions(replace(config, scenario=driven), folder, driver)
+            # Once it is there, calls for several seeds may read it side by side.
+            if not (folder / "dataset.json").exists() or len(load_dataset(folder)) < MORE_DATA:
+                pipeline.collect_transitions(replace(config, scenario=driven), folder, driver)
         else:
             folder = dataset_folder(f"shipped:{driven}/{source if driver == 'teacher' else driver}")
         if driven != scenario:
