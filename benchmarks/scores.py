@@ -58,7 +58,7 @@ MORE_DATA = 60_000
 """Transitions of the teacher, and as many random ones, that `--more-data` collects: four times the shipped ones."""
 MORE_ITERATIONS = 16_000
 """Gradient steps on them."""
-SHOWN_SPAWNS = 200
+USUAL_SPAWNS = 200
 """Spawns of the tables that are named without their number."""
 Source = Literal["teacher", "rule", "collected"]
 """Whose data is mixed with a random driver's: the shipped sets of the teacher or the rule, or more of the teacher."""
@@ -462,7 +462,7 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     marks = {
         "paper": config.recipe == "paper",
         "progress": all(get_scenario(s).reward == "progress" for s in scenarios),
-        f"{spawns}": spawns != SHOWN_SPAWNS,
+        f"{spawns}": spawns != USUAL_SPAWNS,
     }
     name = "-".join(["scores", *(mark for mark, it_is in marks.items() if it_is), *(["from", data] if data else [])])
     save_rows(out / f"{name}.parquet", own)
@@ -475,7 +475,7 @@ def main() -> None:
     """Train, measure, and write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2, 3, 4], help="training seeds")
-    parser.add_argument("--spawns", type=int, default=SHOWN_SPAWNS, help="test spawns per agent")
+    parser.add_argument("--spawns", type=int, default=USUAL_SPAWNS, help="test spawns per agent")
     parser.add_argument("--attacks", nargs="+", default=list(ATTACKS), choices=ATTACKS, help="attacks to drive under")
     parser.add_argument("--scenarios", nargs="+", default=list(PAPER_SCENARIOS), help="target scenarios")
     parser.add_argument("--recipe", default="strong", choices=("strong", "paper"), help="how things are trained")

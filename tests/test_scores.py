@@ -159,7 +159,7 @@ def test_each_recipe_and_reward_has_a_table_of_its_own(benchmark, config, tmp_pa
         benchmark.save_rows(tmp_path / "floors.parquet", rows)
         benchmark.table(tmp_path, [scenario], "", 1, config, tmp_path)
     assert {path.stem for path in tmp_path.glob("scores*.md")} == {"scores-1", "scores-progress-1"}
-    monkeypatch.setattr(benchmark, "SHOWN_SPAWNS", 1)
+    monkeypatch.setattr(benchmark, "USUAL_SPAWNS", 1)
     for scenario in ("lane-3-density-2", "lane-3-density-2:progress"):
         benchmark.table(tmp_path, [scenario], "", 1, config, tmp_path)
     assert {path.stem for path in tmp_path.glob("scores*.md")} >= {"scores", "scores-progress"}
