@@ -198,7 +198,10 @@ def train(
     for name in wanted:
         if name not in offline and name not in online:
             names = ", ".join(f"'{name}'" for name in (*offline, *online))
-            raise RapidError(f"There is no agent '{name}' among {names}. Choose others, or other --steps.")
+            raise RapidError(
+                f"There is no agent '{name}' among {names}. Choose others, or other --steps; some need --ablations or "
+                "--more-data."
+            )
     agents: list[tuple[str, Path]] = []
     origins = {online[name].origin for name in wanted if name in online}
     for name, (settings, source) in offline.items():
