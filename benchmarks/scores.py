@@ -125,10 +125,13 @@ class Adaptation(NamedTuple):
     settings: AdaptConfig
     origin: str
     """The agent trained offline that it starts from or, from scratch, whose network it has."""
-    with_data: bool
+    source: Source | None = None
+    """Whose data goes into the online batches, if any."""
 
 
-def online_recipes(config: Config, scenario: str, steps: int, ablations: bool) -> dict[str, Adaptation]:
+def online_recipes(
+    config: Config, scenario: str, steps: int, ablations: bool = False, more_data: bool = False
+) -> dict[str, Adaptation]:
     """Return how every agent is trained in a scenario for a number of online steps, by name."""
     adapt = replace(adaptation(config.recipe, steps), scenario=scenario)
     discount = adapt.loss.discount if config.recipe == "paper" else min(adapt.loss.discount, MLP_DISCOUNT)
@@ -142,22 +145,27 @@ def online_recipes(config: Config, scenario: str, steps: int, ablations: bool) -
         optimizer=replace(adapt.optimizer, learning_rate=5e-4),
     )
     found = {
-        f"RAPID, {short(steps)}": Adaptation(adapt, "distilled", with_data=True),
-        f"online DDQN, {short(steps)}": Adaptation(from_scratch, "offline DDQN", with_data=False),
+        f"RAPID, {short(steps)}": Adaptation(adapt, "distilled", "teacher"),
+        f"online DDQN, {short(steps)}": Adaptation(from_scratch, "offline DDQN"),
     }
     if adapt.loss.munchausen_weight:
         # The same as RAPID but for the network, where it starts, and that nothing of it is frozen.
         same = replace(from_scratch, loss=replace(adapt.loss, discount=discount))
-        found[f"online Munchausen DQN, {short(steps)}"] = Adaptation(same, "offline DDQN", with_data=False)
+        found[f"online Munchausen DQN, {short(steps)}"] = Adaptation(same, "offline DDQN")
     if config.recipe == "paper":
         rate = pipeline.baseline(config, "dqn").distill.optimizer.learning_rate
         plain = replace(from_scratch.loss, double=False)
         dqn = replace(from_scratch, loss=plain, optimizer=replace(from_scratch.optimizer, learning_rate=rate))
-        found[f"online DQN, {short(steps)}"] = Adaptation(dqn, "offline DQN", with_data=False)
+        found[f"online DQN, {short(steps)}"] = Adaptation(dqn, "offline DQN")
     if ablations:
         for what, weights in (("fine-tuned whole", "all"), ("from scratch", "scratch")):
             other = replace(adapt, train=weights)
-            found[f"RAPID, {short(steps)}, {what}"] = Adaptation(other, "distilled", with_data=True)
+            found[f"RAPID, {short(steps)}, {what}"] = Adaptation(other, "distilled", "teacher")
+    if more_data:
+        # Who begins higher explores no more than the shortest budget does, whatever the steps: else it forgets.
+        careful = replace(adaptation(config.recipe, 0), scenario=scenario, steps=steps)
+        origin = f"distilled, {short(MORE_DATA)}, no J_robust"
+        found[f"RAPID, {short(steps)}, from {short(MORE_DATA)}"] = Adaptation(careful, origin, "collected")
     return found
 
 
@@ -193,7 +201,7 @@ def train(
         offline |= offline_with_more_data(config)
     online: dict[str, Adaptation] = {}
     for steps in budgets:
-        online |= online_recipes(config, scenario, steps, ablations)
+        online |= online_recipes(config, scenario, steps, ablations, more_data)
     wanted = list(only) or [*offline, *online]
     for name in wanted:
         if name not in offline and name not in online:
@@ -211,12 +219,12 @@ def train(
                 pipeline.distill_agent(settings, mixed(settings, data, work, source), home, name)
             if name in wanted:
                 agents.append((name, home / "agent"))
-    for name, (settings, origin, with_data) in online.items():
-        home, own = work / scenario / file_name(name), replace(config, adapt=settings)
+    for name, (settings, origin, source) in online.items():
+        home, own = work / scenario / file_name(name), replace(offline[origin].settings, adapt=settings)
         if name in wanted:
             if not is_trained(home, own, "adapt"):
                 start = work / file_name(origin) / "agent"
-                pipeline.adapt_agent(own, start, mixed(config, data, work) if with_data else None, home, name)
+                pipeline.adapt_agent(own, start, mixed(own, data, work, source) if source else None, home, name)
             agents.append((name, home / "agent"))
     return agents
 
