@@ -1,4 +1,4 @@
-"""Floors and a ceiling: what drivers earn that learned nothing, and what a planner with a perfect model earns.
+"""Floors and ceilings: what drivers earn that learned nothing, and what planners earn that know more or less.
 
 Drives every driver over the same test spawns, under both rewards of the paper's three scenarios, and searches the
 spawns for crashes that no driver could avoid. Writes the raw episodes, the table and the searches:
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rapid.evaluation.agents import open_agent
+from rapid.evaluation.agents import PLANNERS, open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import run_episodes
 from rapid.evaluation.statistics import Estimate, estimate
@@ -26,15 +26,26 @@ from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import ACTIONS, PAPER_SCENARIOS
 from rapid.simulator import make_vec
+from rapid.simulator.belief import DEPTH, DRAWS
 from rapid.simulator.compile import kernel_stamp
 from rapid.simulator.search import WIDTH, unavoidable
 from rapid.spawns import spawn_seeds
 
-DRIVERS = ("random", "idle", "faster", "slower", "rule", "rule-forecast", "planner")
+DRIVERS = (
+    "random",
+    "idle",
+    "faster",
+    "slower",
+    "rule",
+    "rule-forecast",
+    "planner-observation",
+    "planner-cars",
+    "planner",
+)
 REWARDS = {"normalized": "", "progress": ":progress"}
 DEPTHS = (1, 2, 3, 4, 5, 6)
-TOGETHER = {"planner": 8}
-"""Episodes driven side by side, where it is not all: the planner plans whole episodes at the first decision."""
+TOGETHER = dict.fromkeys(PLANNERS, 8)
+"""Episodes driven side by side, where it is not all: planners take long, and what takes long shows its progress."""
 
 
 def drive(driver: str, scenario: str, seeds: list[int], commit: str, title: str) -> list[EpisodeRow]:
@@ -80,17 +91,21 @@ def report(cells: dict[tuple[str, str, str], list[EpisodeRow]], doomed: dict[str
     """Return the tables as Markdown."""
     some = next(iter(cells.values()))
     names = ("numpy", "numba", "gymnasium", "highway-env")
+    commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for rows in cells.values() for row in rows))
     lines = [
-        "# Floors and a ceiling",
+        "# Floors and ceilings",
         "",
         f"{len(some)} test spawns per cell (seeds {some[0].seed} to {some[-1].seed}), the compiled simulator, dynamics "
         "of `highway-v0`, 30 decisions of one second. Numbers are means with 95 % intervals over the spawns. "
         "`rule` and `rule-forecast` see the observation only and use the checks that a teacher is given; `planner` "
-        f"knows the simulator's true state and searches whole episodes with a beam of {WIDTH}: a reference, no bound.",
+        f"knows the simulator's true state and searches whole episodes with a beam of {WIDTH}. `planner-cars` sees all "
+        f"cars but draws what their drivers want, {DRAWS} times a decision, and looks {DEPTH} seconds ahead; "
+        "`planner-observation` has the observation alone and draws the cars that it does not show as well. All three "
+        "are references and no bounds: the last two do not foresee that they will know more later.",
         "",
         "Made with: " + " ".join(["python", "benchmarks/floors.py", *sys.argv[1:]]),
         "",
-        f"Commit {some[0].commit or 'unknown'}, kernels {kernel_stamp().hex()[:12]}; Python "
+        f"Commits {commits}, kernels {kernel_stamp().hex()[:12]}; Python "
         f"{platform.python_version()}, " + ", ".join(f"{name} {version(name)}" for name in names) + ".",
     ]
     for reward in REWARDS:

@@ -169,7 +169,7 @@ class Evaluate:
 
     agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
     """Directories of agents, ONNX files, and drivers by name: slower, idle, faster, random, rule, rule-forecast,
-    rule-foresight, uniform-safe, planner, teacher (the one of --config)."""
+    rule-foresight, uniform-safe, planner, planner-cars, planner-observation, teacher (the one of --config)."""
     evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
     scenario: str = Config.scenario
     """Where they drive."""

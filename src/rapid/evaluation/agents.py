@@ -13,6 +13,9 @@ from rapid.evaluation.metrics import Kind
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
 
+PLANNERS = ("planner", "planner-cars", "planner-observation")
+"""Searches in the simulator: with perfect knowledge, of all cars but not of their drivers, and of what is observed."""
+
 Said = tuple[NDArray[np.float32] | None, str]
 """The values of the actions, if the driver has any, and its words, if it says any."""
 
@@ -44,10 +47,13 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
 
     if spec in SCRIPTED:
         return Scripted(spec, get_scenario(scenario).lanes, seed)
-    if spec == "planner":
+    if spec in PLANNERS:
+        from rapid.simulator.belief import CarsPlanner, ObservationPlanner
         from rapid.simulator.search import PlannerAgent
 
-        return PlannerAgent()
+        if spec == "planner":
+            return PlannerAgent()
+        return CarsPlanner(seed=seed) if spec == "planner-cars" else ObservationPlanner(scenario, seed=seed)
     if Path(spec).is_dir():
         return rapid.load_agent(spec, device)
     if Path(spec).suffix == ".onnx":
@@ -55,9 +61,9 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
 
         return OnnxAgent(spec)
     raise RapidError(
-        f"There is no agent '{spec}'{did_you_mean(spec, (*SCRIPTED, 'planner'))} Give the directory of an agent that "
+        f"There is no agent '{spec}'{did_you_mean(spec, (*SCRIPTED, *PLANNERS))} Give the directory of an agent that "
         f"`rapid distill` or `rapid adapt` wrote, an ONNX file, a scripted driver "
-        f"({', '.join(SCRIPTED)}), or 'planner'."
+        f"({', '.join(SCRIPTED)}), or a planner ({', '.join(PLANNERS)})."
     )
 
 

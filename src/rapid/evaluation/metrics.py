@@ -17,7 +17,7 @@ from rapid.files import atomic_path
 from rapid.scenarios import ACTIONS
 
 Kind = Literal["floor", "teacher", "planner", "learned"]
-"""What kind of agent: needs no learning, a teacher, search with a perfect model, or learned."""
+"""What kind of agent: needs no learning, a teacher, search in the simulator, or learned."""
 
 VEHICLE_LENGTH = 5.0
 """Metres, bumper to bumper, of every vehicle on the road."""

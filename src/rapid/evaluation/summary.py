@@ -11,13 +11,13 @@ from rapid.scenarios import ACTIONS
 KINDS: dict[Kind, str] = {
     "floor": "needs no learning",
     "teacher": "the teacher",
-    "planner": "search with a perfect model",
+    "planner": "search in the simulator",
     "learned": "learned",
 }
 """Kinds of agents in the order of the table. All but `learned` are there for reference."""
 
 NOT_APPLICABLE = "n/a"
-NOT_APPLICABLE_WHY = "a gradient attack needs a network; and the planner reads the world, not an observation."
+NOT_APPLICABLE_WHY = "a gradient attack needs a network; and who reads the world sees no observation."
 NOT_RUN = "–"
 
 _SHOWN = {
@@ -29,6 +29,8 @@ _SHOWN = {
     "rule": "rule",
     "rule-forecast": "rule, forecast",
     "rule-foresight": "rule, foresight",
+    "planner-cars": "planner, drivers unknown",
+    "planner-observation": "planner, as observed",
 }
 
 CLEAN = "none"

@@ -147,7 +147,7 @@ def _tiles(lead: SummaryRow, rows: Sequence[SummaryRow]) -> Markup:
     if paper is not None:
         tiles.insert(1, _tile("the paper's return", f"{paper.mean:.2f}", f"± {paper.spread:.2f}, as printed"))
     slower = next((row for row in rows if row.agent == "slower"), None)
-    planner = next((row for row in rows if row.kind == "planner"), None)
+    planner = next((row for row in rows if row.agent == "planner"), None)
     if slower is not None and planner is not None:
         floor, top = slower.metrics["episode_return"].value, planner.metrics["episode_return"].value
         ours = of["episode_return"].value

@@ -237,7 +237,7 @@ def plan(
     Raises:
         RapidError: the environment is not compiled or has not begun, or a number is out of range.
     """
-    state, settings = _compiled(env)
+    state, settings = compiled_worlds(env)
     if width < 1 or (depth is not None and depth < 1):
         raise RapidError(f"The planner's width and depth must be at least 1; got {width} and {depth}.")
     chosen = list(range(len(state.world))) if worlds is None else list(worlds)
@@ -249,7 +249,7 @@ def plan(
         np.zeros(len(chosen), np.int64),
         np.zeros(len(chosen)),
     )
-    tries = _tries(settings)
+    tries = tries_of(settings)
     for row, i in enumerate(chosen):  # one call each: a search takes long enough to be interrupted and to be watched
         world = state.cars[i], state.tags[i], state.world[i]
         found.returns[row], found.lengths[row] = search_world(
@@ -273,7 +273,7 @@ def unavoidable(env: Any, depth: int) -> NDArray[np.bool_]:
     Raises:
         RapidError: the environment is not compiled or has not begun, or the depth is not at least 1.
     """
-    state, settings = _compiled(env)
+    state, settings = compiled_worlds(env)
     if depth < 1:
         raise RapidError(f"The depth of the search must be at least 1 decision; got {depth}.")
     doomed = np.zeros(len(state.world), np.bool_)
@@ -310,7 +310,7 @@ class PlannerAgent:
         Raises:
             RapidError: they are not of the compiled simulator.
         """
-        _compiled(env, begun=False)
+        compiled_worlds(env, begun=False)
         return BoundPlanner(self, env)
 
 
@@ -320,7 +320,7 @@ class BoundPlanner:
     def __init__(self, agent: PlannerAgent, env: Any) -> None:
         self.name = agent.name
         self._agent, self._env = agent, env
-        state, self._settings = _compiled(env, begun=False)
+        state, self._settings = compiled_worlds(env, begun=False)
         worlds = len(state.world)
         self._plans: list[NDArray[np.int64]] = [np.zeros(0, np.int64)] * worlds
         self._foreseen: State | None = None
@@ -330,8 +330,8 @@ class BoundPlanner:
 
         The observations are not read.
         """
-        state, settings = _compiled(self._env)
-        ended = (state.world[:, TERMINATED] != 0) | (state.world[:, TRUNCATED] != 0)
+        state, settings = compiled_worlds(self._env)
+        ended = have_ended(state)
         as_foreseen = np.zeros(len(ended), np.bool_)
         if self._foreseen is not None:
             parts = zip(self._foreseen[:3], state[:3], strict=True)
@@ -353,7 +353,7 @@ class BoundPlanner:
         return actions
 
 
-def _compiled(env: Any, begun: bool = True) -> tuple[State, Settings]:
+def compiled_worlds(env: Any, begun: bool = True) -> tuple[State, Settings]:
     """Return the worlds and the configuration of a compiled environment, wrapped or not."""
     from rapid.simulator.env import CompiledHighwayEnv
     from rapid.simulator.vector_env import CompiledVectorEnv
@@ -369,6 +369,11 @@ def _compiled(env: Any, begun: bool = True) -> tuple[State, Settings]:
     return inner.state, inner.settings
 
 
+def have_ended(state: State) -> NDArray[np.bool_]:
+    """Return which worlds' episodes are over, (B,)."""
+    return (state.world[:, TERMINATED] != 0) | (state.world[:, TRUNCATED] != 0)
+
+
 def _decisions_left(state: State, settings: Settings, index: int) -> int:
     left = (settings.duration - state.world[index, TIME]) / settings.decision_time
     # One more than needed, because the clock adds up rounded numbers; a plan ends with its episode anyway.
@@ -380,5 +385,6 @@ def _index(settings: Settings, meta: int) -> list[int]:
     return np.flatnonzero(settings.actions == meta).tolist()
 
 
-def _tries(settings: Settings) -> NDArray[np.int64]:
+def tries_of(settings: Settings) -> NDArray[np.int64]:
+    """Return the actions of a configuration in the order in which they are tried."""
     return np.array([i for meta in _TRY for i in _index(settings, meta)], np.int64)

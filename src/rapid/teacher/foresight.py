@@ -18,36 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, NUM_VEHICLES, SLOWER, Scenario
+from rapid.simulator.belief import BRAKING, GAP_TIME, STANDSTILL_GAP, closeness, reconstruct
 from rapid.simulator.compile import kernel
-from rapid.simulator.dynamics import sort_by_x
 from rapid.simulator.observation import INFO_COLUMNS
 from rapid.simulator.search import distinct, select
 from rapid.simulator.settings import Settings, merge_config, read_settings
 from rapid.simulator.spawn import nearest_speed_index
-from rapid.simulator.state import (
-    CAR_ROWS,
-    COS,
-    EXPONENT,
-    HEADING,
-    LANE,
-    ORDER,
-    RANK,
-    SIN,
-    SPEED,
-    SPEED_INDEX,
-    START_X,
-    TAG_ROWS,
-    TARGET_LANE,
-    TARGET_SPEED,
-    TIMER,
-    VX,
-    VY,
-    WORLD_ENTRIES,
-    X,
-    Y,
-)
+from rapid.simulator.state import CAR_ROWS, RANK, SPEED, TAG_ROWS, TARGET_LANE, WORLD_ENTRIES, X
 from rapid.simulator.step import step_world
-from rapid.teacher.scene import CAR_LENGTH, LANE_WIDTH, Scene
+from rapid.teacher.scene import LANE_WIDTH, Scene
 
 DEPTH = 6
 """Decisions, and so seconds, looked ahead, the action included."""
@@ -59,17 +38,11 @@ BEYOND = 8.0
 """Metres behind the farthest car seen at which unseen traffic is feared."""
 CLOSENESS = 3.0
 """What the closest distance costs, in rewards per second; the reward itself is at most 1."""
-STANDSTILL_GAP, GAP_TIME, BRAKING = 3.0, 0.5, 3.0
-"""Distance that counts as close: metres, plus seconds of speed, plus what closing in takes to brake away at m/s²."""
 CAUTION = (DEPTH, WIDTH, FRAMES, BEYOND, CLOSENESS, STANDSTILL_GAP, GAP_TIME, BRAKING)
 """Everything above, which shapes the facts and so the prompts."""
 
-_CRUISE = (22.5, 24.0)
-"""Speeds that traffic wants, m/s: it is spawned at 21 to 24."""
 _MOST_SPEED = 40.0
 """m/s, either way; highway-env lets no car drive faster."""
-_ORIGIN = 1_000.0
-"""Where the ego is put on the simulator's road, m, with room behind."""
 _TRIES = np.array([IDLE, SLOWER, LANE_LEFT, LANE_RIGHT, FASTER])
 """Order of trying; of actions that command the same the first stands for all."""
 
@@ -125,49 +98,10 @@ def _settings(lanes: int) -> Settings:
 
 
 @kernel
-def _start(rows, settings, cars, tags, world):
-    """Fill a world from rows (x, y, vx, vy, lane aimed at), the ego first."""
-    for i in range(len(rows)):
-        x, y, forward, aside = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
-        speed = math.sqrt(forward * forward + aside * aside)
-        heading = math.atan2(aside, forward) if speed > 0.1 else 0.0
-        heading = min(max(heading, -math.pi / 4), math.pi / 4)
-        cars[X, i], cars[Y, i], cars[HEADING, i], cars[SPEED, i] = _ORIGIN + x, y, heading, speed
-        cars[COS, i], cars[SIN, i] = math.cos(heading), math.sin(heading)
-        cars[VX, i], cars[VY, i] = speed * cars[COS, i], speed * cars[SIN, i]
-        cars[TARGET_SPEED, i] = min(max(speed, _CRUISE[0]), _CRUISE[1])
-        cars[TIMER, i], cars[EXPONENT, i] = 0.5, 4.0
-        tags[LANE, i] = int(min(max(np.rint(y / LANE_WIDTH), 0), settings.lanes - 1))
-        tags[TARGET_LANE, i] = int(rows[i, 4])
-        tags[ORDER, i] = tags[RANK, i] = i
-    index = nearest_speed_index(cars[SPEED, 0], settings.target_speeds)
-    world[SPEED_INDEX] = index
-    cars[TARGET_SPEED, 0] = settings.target_speeds[index]
-    world[START_X] = cars[X, 0]
-    sort_by_x(cars, tags)
-
-
-@kernel
-def _closeness(cars, tags):
-    """Return how much too close the ego is to a car on its lane or the one it heads for: 0 not at all, 1 touching."""
-    worst = 0.0
-    for j in range(1, cars.shape[1]):
-        beside = abs(cars[Y, j] - cars[Y, 0]) < 3.0 or abs(cars[Y, j] - LANE_WIDTH * tags[TARGET_LANE, 0]) < 3.0
-        if not beside and tags[TARGET_LANE, j] != tags[TARGET_LANE, 0]:
-            continue
-        front, rear = (j, 0) if cars[X, j] >= cars[X, 0] else (0, j)
-        closing = max(cars[SPEED, rear] - cars[SPEED, front], 0.0)
-        wanted = STANDSTILL_GAP + GAP_TIME * cars[SPEED, rear] + closing * closing / (2 * BRAKING)
-        gap = cars[X, front] - cars[X, rear] - CAR_LENGTH
-        worst = max(worst, (wanted - gap) / wanted)
-    return min(worst, 1.0)
-
-
-@kernel
 def _step(cars, tags, world, action, settings, info):
     """Drive a world through a decision; return what it earned and whether it ended."""
     earned, terminated, _ = step_world(cars, tags, world, settings.actions[action], settings, info)
-    return earned - CLOSENESS * _closeness(cars, tags), terminated
+    return earned - CLOSENESS * closeness(cars, tags), terminated
 
 
 @kernel
@@ -180,7 +114,7 @@ def _search(rows, settings, tries, width, depth, found):
     vehicles, speeds, places = len(rows), len(settings.target_speeds), width * len(tries)
     start_cars, start_tags = np.zeros((CAR_ROWS, vehicles)), np.zeros((TAG_ROWS, vehicles), np.int64)
     start_world = np.zeros(WORLD_ENTRIES)
-    _start(rows, settings, start_cars, start_tags, start_world)
+    reconstruct(rows, settings, start_cars, start_tags, start_world)
     all_cars = np.empty((2, places, CAR_ROWS, vehicles))
     all_tags = np.empty((2, places, TAG_ROWS, vehicles), np.int64)
     all_world = np.empty((2, places, WORLD_ENTRIES))

@@ -1,0 +1,375 @@
+# pyright: basic
+# Kernels: the types that matter here are numba's, which pyright does not know.
+"""Planners that do not know everything: how much of the perfect planner's lead is knowledge that no policy has.
+
+The planner of :mod:`rapid.simulator.search` knows which speed every driver wants, when each next thinks of changing
+lane, and the cars that no observation shows. Here all that is drawn at random, several times over, and the plan taken
+is the one that does best in the mean of these worlds; its first action is driven, then everything is drawn anew (open-
+loop feedback control: Bertsekas, "Dynamic Programming and Optimal Control"). A plan does not foresee that more will be
+known when its second action is due, and the search is short, so this too is a reference and no bound.
+"""
+
+import math
+import zlib
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rapid.errors import RapidError
+from rapid.scenarios import Scenario, get_scenario
+from rapid.simulator.compile import kernel
+from rapid.simulator.dynamics import sort_by_x
+from rapid.simulator.observation import INFO_COLUMNS
+from rapid.simulator.search import compiled_worlds, distinct, have_ended, select, tries_of
+from rapid.simulator.settings import Settings, read_settings
+from rapid.simulator.spawn import LANE_WIDTH, TRAFFIC_START_SPEED, nearest_speed_index
+from rapid.simulator.state import (
+    CAR_ROWS,
+    COS,
+    EXPONENT,
+    HEADING,
+    LANE,
+    ORDER,
+    RANK,
+    SIN,
+    SPEED,
+    SPEED_INDEX,
+    START_X,
+    TAG_ROWS,
+    TARGET_LANE,
+    TARGET_SPEED,
+    TIMER,
+    VX,
+    VY,
+    WORLD_ENTRIES,
+    X,
+    Y,
+)
+from rapid.simulator.step import step_world
+
+Worlds = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]
+"""Cars (K, CAR_ROWS, N), tags (K, TAG_ROWS, N) and the rest (K, WORLD_ENTRIES) of K worlds."""
+
+DRAWS = 6
+"""Worlds drawn per decision; 16 were measured to gain nothing."""
+WIDTH = 6
+"""Sequences of actions kept per decision of a plan."""
+DEPTH = 8
+"""Decisions that a plan looks ahead; with 12 the planner drove slower and earned less."""
+CRASH = 20.0
+"""What a crash costs beside its own reward: about what the rest of an episode pays."""
+FRAMES = 5
+"""Frames per decision where worlds are drawn around an observation. The simulator's own 15 take three times as long
+and pay only where the state is exact."""
+CLOSENESS = 0.5
+"""What the closest distance costs the planner that has an observation alone, in rewards per second."""
+REACH = (-60.0, 200.0)
+"""Metres from the ego, behind and ahead, beyond which a car cannot matter within `DEPTH` seconds."""
+UNSEEN = 12
+"""Cars drawn ahead of the farthest one seen, where the observation has no room for more."""
+
+STANDSTILL_GAP, GAP_TIME, BRAKING = 3.0, 0.5, 3.0
+"""Distance that counts as close: metres, plus seconds of speed, plus what closing in takes to brake away at m/s²."""
+CAR_LENGTH = 5.0
+LATERAL_TIME = 0.6
+"""Seconds over which a lateral offset is steered away; a lateral velocity so tells the lane aimed at."""
+_GAPS = (0.3, 1.7)
+"""Between which the gaps of unseen traffic lie, in mean gaps."""
+EXPONENTS = (3.5, 4.5)
+"""Between which highway-env draws the exponent of its driver model."""
+_CRUISE = (22.5, 24.0)
+"""Speeds that traffic is taken to want where nothing is drawn, m/s: it is spawned at 21 to 24."""
+_ORIGIN = 1_000.0
+"""Where the ego is put on the simulator's road, m, with room behind."""
+
+
+@kernel
+def reconstruct(rows, settings, cars, tags, world):
+    """Fill a world from what can be seen; what cannot has the simulator's default.
+
+    Args:
+        rows: float64 (N, 5), the ego first: metres ahead of the ego, y, vx, vy, and the lane aimed at.
+        settings: the configuration.
+        cars: float64 (CAR_ROWS, N), zeros, overwritten; the next two likewise.
+        tags: int64 (TAG_ROWS, N).
+        world: float64 (WORLD_ENTRIES,).
+    """
+    for i in range(len(rows)):
+        x, y, forward, aside = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
+        speed = math.sqrt(forward * forward + aside * aside)
+        heading = math.atan2(aside, forward) if speed > 0.1 else 0.0
+        heading = min(max(heading, -math.pi / 4), math.pi / 4)
+        cars[X, i], cars[Y, i], cars[HEADING, i], cars[SPEED, i] = _ORIGIN + x, y, heading, speed
+        cars[COS, i], cars[SIN, i] = math.cos(heading), math.sin(heading)
+        cars[VX, i], cars[VY, i] = speed * cars[COS, i], speed * cars[SIN, i]
+        cars[TARGET_SPEED, i] = min(max(speed, _CRUISE[0]), _CRUISE[1])
+        cars[TIMER, i], cars[EXPONENT, i] = 0.5, 4.0
+        tags[LANE, i] = int(min(max(np.rint(y / LANE_WIDTH), 0), settings.lanes - 1))
+        tags[TARGET_LANE, i] = int(rows[i, 4])
+        tags[ORDER, i] = tags[RANK, i] = i
+    index = nearest_speed_index(cars[SPEED, 0], settings.target_speeds)
+    world[SPEED_INDEX] = index
+    cars[TARGET_SPEED, 0] = settings.target_speeds[index]
+    world[START_X] = cars[X, 0]
+    sort_by_x(cars, tags)
+
+
+@kernel
+def closeness(cars, tags):
+    """Return how much too close the ego is to a car on its lane or the one it heads for: 0 not at all, 1 touching."""
+    worst = 0.0
+    for j in range(1, cars.shape[1]):
+        beside = abs(cars[Y, j] - cars[Y, 0]) < 3.0 or abs(cars[Y, j] - LANE_WIDTH * tags[TARGET_LANE, 0]) < 3.0
+        if not beside and tags[TARGET_LANE, j] != tags[TARGET_LANE, 0]:
+            continue
+        front, rear = (j, 0) if cars[X, j] >= cars[X, 0] else (0, j)
+        closing = max(cars[SPEED, rear] - cars[SPEED, front], 0.0)
+        wanted = STANDSTILL_GAP + GAP_TIME * cars[SPEED, rear] + closing * closing / (2 * BRAKING)
+        gap = cars[X, front] - cars[X, rear] - CAR_LENGTH
+        worst = max(worst, (wanted - gap) / wanted)
+    return min(worst, 1.0)
+
+
+@kernel
+def search_belief(cars, tags, world, tries, settings, width, depth, caution, crash, found):
+    """Write for every action what the best plan that begins with it earns in the mean of K worlds into `found`.
+
+    A beam search for each action over sequences of actions. A node holds a copy of every world that has not crashed.
+
+    Args:
+        cars: float64 (K, CAR_ROWS, N), the worlds drawn, with the next two; left as they are.
+        tags: see `cars`.
+        world: see `cars`.
+        tries: int64, indices into ``settings.actions``.
+        settings: the configuration.
+        width: nodes kept per decision.
+        depth: decisions to look ahead.
+        caution: what the closest distance costs a second.
+        crash: what a crash costs beside its own reward.
+        found: float64 (actions,), overwritten.
+    """
+    draws, vehicles, speeds = cars.shape[0], cars.shape[2], len(settings.target_speeds)
+    places = width * len(tries)
+    all_cars = np.empty((2, places, draws, CAR_ROWS, vehicles))
+    all_tags = np.empty((2, places, draws, TAG_ROWS, vehicles), np.int64)
+    all_world = np.empty((2, places, draws, WORLD_ENTRIES))
+    all_values, crashed = np.empty((2, places)), np.zeros((2, places, draws), np.bool_)
+    kinds, alive = np.empty(places, np.int64), np.empty(places, np.bool_)
+    beam, different = np.zeros(width, np.int64), np.empty(len(tries), np.int64)
+    counts, info = np.empty(settings.lanes * vehicles * speeds, np.int64), np.empty(INFO_COLUMNS)
+    for action in range(len(found)):
+        all_cars[1, 0], all_tags[1, 0], all_world[1, 0] = cars, tags, world
+        all_values[1, 0], crashed[1, 0] = 0.0, False
+        kept, beam[0], best = 1, 0, -np.inf
+        for t in range(depth):
+            now, then = (t + 1) % 2, t % 2
+            node = 0
+            for parent in beam[:kept]:
+                first = 0
+                while crashed[now, parent, first]:
+                    first += 1
+                count, different[0] = 1, action
+                if t > 0:
+                    # Every world of a node has been commanded the same.
+                    count = distinct(
+                        all_cars[now, parent, first],
+                        all_tags[now, parent, first],
+                        all_world[now, parent, first],
+                        tries,
+                        settings,
+                        different,
+                    )
+                for k in range(count):
+                    value, first = all_values[now, parent], -1
+                    for draw in range(draws):
+                        crashed[then, node, draw] = crashed[now, parent, draw]
+                        if crashed[now, parent, draw]:
+                            continue
+                        own_cars, own_tags = all_cars[then, node, draw], all_tags[then, node, draw]
+                        own_world = all_world[then, node, draw]
+                        own_cars[:], own_tags[:] = all_cars[now, parent, draw], all_tags[now, parent, draw]
+                        own_world[:] = all_world[now, parent, draw]
+                        meta = settings.actions[different[k]]
+                        earned, ended, _ = step_world(own_cars, own_tags, own_world, meta, settings, info)
+                        if caution > 0:
+                            earned -= caution * closeness(own_cars, own_tags)
+                        if ended:
+                            crashed[then, node, draw] = True
+                            earned -= crash
+                        elif first < 0:
+                            first = draw
+                        value += earned / draws
+                    all_values[then, node], alive[node], kinds[node] = value, first >= 0, 0
+                    if alive[node]:
+                        # As in `search_world`: alike are nodes with the same lane, cars behind and speed.
+                        own_cars, own_tags = all_cars[then, node, first], all_tags[then, node, first]
+                        kinds[node] = own_tags[TARGET_LANE, 0] * vehicles + own_tags[RANK, 0]
+                        kinds[node] = kinds[node] * speeds + nearest_speed_index(
+                            own_cars[SPEED, 0], settings.target_speeds
+                        )
+                    if not alive[node] or t == depth - 1:
+                        best = max(best, value)
+                    node += 1
+            kept = select(all_values[then, :node], kinds[:node], alive[:node], counts, beam)
+            if kept == 0:
+                break
+        found[action] = best
+
+
+class ObservationPlanner:
+    """Drives by the observation alone, by plans that do well in the mean of worlds drawn at random around it.
+
+    What no policy can exceed by much without being cleverer than this search: it has the simulator as its model, and
+    takes some hundredths of a second per decision. What is drawn depends on the observation and the seed alone, so an
+    episode is the same however many are driven beside it.
+
+    Args:
+        scenario: the road and the reward.
+        draws: worlds drawn per decision.
+        width: sequences of actions kept per decision of a plan.
+        depth: decisions to look ahead.
+        seed: what is drawn.
+
+    Raises:
+        RapidError: a number is below 1.
+    """
+
+    name = "planner-observation"
+    kind = "planner"
+
+    def __init__(
+        self, scenario: str | Scenario, draws: int = DRAWS, width: int = WIDTH, depth: int = DEPTH, seed: int = 0
+    ) -> None:
+        named = get_scenario(scenario) if isinstance(scenario, str) else scenario
+        settings = read_settings(named.config(), named.dynamics)
+        self._settings = _endless(settings, FRAMES)
+        self._effort, self._seed = _effort(draws, width, depth), seed
+
+    def act(self, obs_BVF: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return one action for each observation (presence, x, y, vx, vy; m, m/s)."""
+        actions = np.zeros(len(obs_BVF), np.int64)
+        for i, obs_VF in enumerate(obs_BVF):
+            rng = np.random.default_rng((self._seed, zlib.crc32(np.ascontiguousarray(obs_VF).tobytes())))
+            worlds = _from_observation(obs_VF.astype(np.float64), self._settings, self._effort.draws, rng)
+            actions[i] = _decide(worlds, self._settings, self._effort, CLOSENESS, rng)
+        return actions
+
+
+class CarsPlanner:
+    """Knows where every car is, how fast, and which lane it heads for, but not what its driver wants; that is drawn.
+
+    Between :class:`ObservationPlanner` and the planner of :mod:`rapid.simulator.search`, to tell apart what the
+    observation hides from what other drivers do. See the former for the arguments and what is raised. Give it to
+    :func:`rapid.evaluation.rollouts.run_episodes`, or call :meth:`bind`.
+    """
+
+    name = "planner-cars"
+    kind = "planner"
+
+    def __init__(self, draws: int = DRAWS, width: int = WIDTH, depth: int = DEPTH, seed: int = 0) -> None:
+        self.effort, self.seed = _effort(draws, width, depth), seed
+
+    def bind(self, env: Any) -> "BoundCarsPlanner":
+        """Return the planner of these worlds.
+
+        Raises:
+            RapidError: they are not of the compiled simulator.
+        """
+        return BoundCarsPlanner(self, env)
+
+
+class BoundCarsPlanner:
+    """The planner of one environment's worlds."""
+
+    def __init__(self, agent: CarsPlanner, env: Any) -> None:
+        self.name = agent.name
+        self._agent, self._env = agent, env
+        settings = compiled_worlds(env, begun=False)[1]
+        self._settings = _endless(settings, settings.frames)
+
+    def act(self, obs_BVF: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return one action for each world of the environment, 0 where the episode has ended.
+
+        The observations are not read.
+        """
+        state, effort = compiled_worlds(self._env)[0], self._agent.effort
+        actions = np.zeros(len(state.world), np.int64)
+        for i in np.flatnonzero(~have_ended(state)):
+            rng = np.random.default_rng((self._agent.seed, zlib.crc32(state.cars[i, X].tobytes())))
+            worlds = _within_reach(state.cars[i], state.tags[i], state.world[i], effort.draws)
+            actions[i] = _decide(worlds, self._settings, effort, 0.0, rng)
+        return actions
+
+
+class _Effort(NamedTuple):
+    draws: int
+    width: int
+    depth: int
+
+
+def _effort(draws: int, width: int, depth: int) -> _Effort:
+    if min(draws, width, depth) < 1:
+        raise RapidError(f"A planner's draws, width and depth must be at least 1; got {draws}, {width}, {depth}.")
+    return _Effort(draws, width, depth)
+
+
+def _endless(settings: Settings, frames: int) -> Settings:
+    """Return the settings with other frames per decision and no time limit: nothing that is seen tells the time."""
+    return settings._replace(duration=math.inf, frames=frames, dt=settings.decision_time / frames)
+
+
+def _decide(worlds: Worlds, settings: Settings, effort: _Effort, caution: float, rng: np.random.Generator) -> int:
+    """Return the first action of the best plan, after drawing what every other driver wants in each of the worlds."""
+    cars, tags, world = worlds
+    others = effort.draws, cars.shape[2] - 1
+    cars[:, TIMER, 1:] = rng.random(others)
+    cars[:, EXPONENT, 1:] = rng.uniform(*EXPONENTS, others)
+    cars[:, TARGET_SPEED, 1:] = rng.uniform(*TRAFFIC_START_SPEED, others)
+    tries, values = tries_of(settings), np.empty(len(settings.actions))
+    search_belief(cars, tags, world, tries, settings, effort.width, effort.depth, caution, CRASH, values)
+    return int(tries[np.argmax(values[tries])])
+
+
+def _within_reach(cars: NDArray[np.float64], tags: NDArray[np.int64], world: NDArray[np.float64], draws: int) -> Worlds:
+    """Return copies of one world, as many as are drawn, without the cars that are too far away to matter."""
+    ahead = cars[X] - cars[X, 0]
+    near = np.flatnonzero((ahead >= REACH[0]) & (ahead <= REACH[1]))
+    own_cars, own_tags = cars[:, near], tags[:, near]
+    own_tags[ORDER] = np.argsort(own_cars[X], kind="stable")
+    own_tags[RANK, own_tags[ORDER]] = np.arange(len(near))
+    return tuple(np.repeat(part[None], draws, 0) for part in (own_cars, own_tags, world))  # type: ignore[return-value]
+
+
+def _from_observation(obs_VF: NDArray[np.float64], settings: Settings, draws: int, rng: np.random.Generator) -> Worlds:
+    """Return worlds as one observation shows them; traffic beyond what it has room for is drawn in each."""
+    rows_VF = obs_VF[obs_VF[:, 0] >= 0.5]
+    seen_V5 = np.empty((len(rows_VF), 5))
+    seen_V5[:, 0] = rows_VF[:, 1] - rows_VF[0, 1]
+    seen_V5[:, 1:4] = rows_VF[:, 2:5]
+    aimed_V = np.rint((rows_VF[:, 2] + LATERAL_TIME * rows_VF[:, 4]) / LANE_WIDTH)
+    seen_V5[:, 4] = aimed_V.clip(0, settings.lanes - 1)
+    unseen = UNSEEN if len(rows_VF) == len(obs_VF) else 0
+    vehicles = len(seen_V5) + unseen
+    cars, tags = np.zeros((draws, CAR_ROWS, vehicles)), np.zeros((draws, TAG_ROWS, vehicles), np.int64)
+    world = np.zeros((draws, WORLD_ENTRIES))
+    for k in range(draws):
+        rows = np.concatenate([seen_V5, _unseen(seen_V5[1:], unseen, settings, rng)])
+        reconstruct(rows, settings, cars[k], tags[k], world[k])
+    return cars, tags, world
+
+
+def _unseen(seen_V5: NDArray[np.float64], count: int, settings: Settings, rng: np.random.Generator) -> Any:
+    """Return traffic beyond the cars seen, as dense as it is spawned and as fast as that seen ahead."""
+    rows = np.zeros((count, 5))
+    if count:
+        farthest = np.abs(seen_V5[:, 0]).max()
+        ahead = seen_V5[seen_V5[:, 0] > 0] if (seen_V5[:, 0] > 0).any() else seen_V5
+        mean, spread = ahead[:, 2].mean(), max(ahead[:, 2].std(), 1.0)
+        gap = settings.traffic_spacing * (12.0 + sum(TRAFFIC_START_SPEED) / 2) * settings.spacing_factor
+        rows[:, 0] = farthest + np.cumsum(gap * rng.uniform(*_GAPS, count)) - gap * rng.random()
+        rows[:, 0] = rows[:, 0].clip(farthest)
+        rows[:, 4] = rng.integers(settings.lanes, size=count)
+        rows[:, 1] = LANE_WIDTH * rows[:, 4]
+        rows[:, 2] = rng.normal(mean, spread, count).clip(5.0, TRAFFIC_START_SPEED[1])
+    return rows
