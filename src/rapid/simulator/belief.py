@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
-from rapid.scenarios import Scenario, get_scenario
+from rapid.scenarios import FEATURES, NUM_FEATURES, NUM_VEHICLES, Scenario, get_scenario
 from rapid.simulator.compile import kernel
 from rapid.simulator.dynamics import sort_by_x
-from rapid.simulator.observation import INFO_COLUMNS
+from rapid.simulator.observation import INFO_COLUMNS, SIGHT
 from rapid.simulator.search import compiled_worlds, distinct, have_ended, select, tries_of
 from rapid.simulator.settings import Settings, read_settings
 from rapid.simulator.spawn import LANE_WIDTH, TRAFFIC_START_SPEED, nearest_speed_index
@@ -80,6 +80,8 @@ EXPONENTS = (3.5, 4.5)
 """Between which highway-env draws the exponent of its driver model."""
 _CRUISE = (22.5, 24.0)
 """Speeds that traffic is taken to want where nothing is drawn, m/s: it is spawned at 21 to 24."""
+_MOST_SPEED = 40.0
+"""m/s; highway-env lets no car drive faster."""
 _ORIGIN = 1_000.0
 """Where the ego is put on the simulator's road, m, with room behind."""
 
@@ -96,7 +98,9 @@ def reconstruct(rows, settings, cars, tags, world):
         world: float64 (WORLD_ENTRIES,).
     """
     for i in range(len(rows)):
-        x, y, forward, aside = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
+        # A perturbed observation may say anything; no car is far beside the road, drives backwards, or is that fast.
+        x, y = rows[i, 0], min(max(rows[i, 1], -LANE_WIDTH), settings.lanes * LANE_WIDTH)
+        forward, aside = min(max(rows[i, 2], 0.0), _MOST_SPEED), min(max(rows[i, 3], -_MOST_SPEED), _MOST_SPEED)
         speed = math.sqrt(forward * forward + aside * aside)
         heading = math.atan2(aside, forward) if speed > 0.1 else 0.0
         heading = min(max(heading, -math.pi / 4), math.pi / 4)
@@ -220,9 +224,9 @@ def search_belief(cars, tags, world, tries, settings, width, depth, caution, cra
 class ObservationPlanner:
     """Drives by the observation alone, by plans that do well in the mean of worlds drawn at random around it.
 
-    What no policy can exceed by much without being cleverer than this search: it has the simulator as its model, and
-    takes some hundredths of a second per decision. What is drawn depends on the observation and the seed alone, so an
-    episode is the same however many are driven beside it.
+    A yardstick for policies, which see the same: it has the simulator as its model, and takes some hundredths of a
+    second per decision. What is drawn depends on the observation and the seed alone, so an episode is the same however
+    many are driven beside it.
 
     Args:
         scenario: the road and the reward.
@@ -247,10 +251,26 @@ class ObservationPlanner:
         self._effort, self._seed = _effort(draws, width, depth), seed
 
     def act(self, obs_BVF: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return one action for each observation (presence, x, y, vx, vy; m, m/s)."""
+        """Return one action for each observation (presence, x, y, vx, vy; the ego first; m, m/s).
+
+        A perturbed one is read as it comes, as :func:`rapid.teacher.scene.read_scenes` does.
+
+        Raises:
+            RapidError: the array has the wrong shape or holds a number that is not finite.
+        """
+        seen_BVF = np.ascontiguousarray(obs_BVF, np.float32)
+        if seen_BVF.ndim != 3 or seen_BVF.shape[1:] != (NUM_VEHICLES, NUM_FEATURES):
+            raise RapidError(
+                f"{self.name} reads observations of shape (worlds, {NUM_VEHICLES}, {NUM_FEATURES}) with the features "
+                f"{', '.join(FEATURES)}, not {seen_BVF.shape}."
+            )
+        if not np.isfinite(seen_BVF).all():
+            raise RapidError(
+                f"An observation given to {self.name} holds a number that is not finite: check the attack."
+            )
         actions = np.zeros(len(obs_BVF), np.int64)
-        for i, obs_VF in enumerate(obs_BVF):
-            rng = np.random.default_rng((self._seed, zlib.crc32(np.ascontiguousarray(obs_VF).tobytes())))
+        for i, obs_VF in enumerate(seen_BVF):
+            rng = np.random.default_rng((self._seed, zlib.crc32(obs_VF.tobytes())))
             worlds = _from_observation(obs_VF.astype(np.float64), self._settings, self._effort.draws, rng)
             actions[i] = _decide(worlds, self._settings, self._effort, CLOSENESS, rng)
         return actions
@@ -343,7 +363,7 @@ def _within_reach(cars: NDArray[np.float64], tags: NDArray[np.int64], world: NDA
 
 def _from_observation(obs_VF: NDArray[np.float64], settings: Settings, draws: int, rng: np.random.Generator) -> Worlds:
     """Return worlds as one observation shows them; traffic beyond what it has room for is drawn in each."""
-    rows_VF = obs_VF[obs_VF[:, 0] >= 0.5]
+    rows_VF = obs_VF[_believed(obs_VF)]
     seen_V5 = np.empty((len(rows_VF), 5))
     seen_V5[:, 0] = rows_VF[:, 1] - rows_VF[0, 1]
     seen_V5[:, 1:4] = rows_VF[:, 2:5]
@@ -357,6 +377,13 @@ def _from_observation(obs_VF: NDArray[np.float64], settings: Settings, draws: in
         rows = np.concatenate([seen_V5, _unseen(seen_V5[1:], unseen, settings, rng)])
         reconstruct(rows, settings, cars[k], tags[k], world[k])
     return cars, tags, world
+
+
+def _believed(obs_VF: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which rows count as cars, the ego always: those present, and no farther off than cars are shown."""
+    believed_V = (obs_VF[:, 0] >= 0.5) & (np.abs(obs_VF[:, 1] - obs_VF[0, 1]) <= SIGHT)
+    believed_V[0] = True
+    return believed_V
 
 
 def _unseen(seen_V5: NDArray[np.float64], count: int, settings: Settings, rng: np.random.Generator) -> Any:

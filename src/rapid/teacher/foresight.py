@@ -41,8 +41,6 @@ CLOSENESS = 3.0
 CAUTION = (DEPTH, WIDTH, FRAMES, BEYOND, CLOSENESS, STANDSTILL_GAP, GAP_TIME, BRAKING)
 """Everything above, which shapes the facts and so the prompts."""
 
-_MOST_SPEED = 40.0
-"""m/s, either way; highway-env lets no car drive faster."""
 _TRIES = np.array([IDLE, SLOWER, LANE_LEFT, LANE_RIGHT, FASTER])
 """Order of trying; of actions that command the same the first stands for all."""
 
@@ -68,13 +66,8 @@ def look_ahead(scene: Scene) -> tuple[WayOn, ...]:
     rows += [(car.ahead, car.side, car.speed, car.drift, car.toward) for car in scene.cars]
     if len(scene.cars) >= NUM_VEHICLES - 1:
         rows += _feared(scene)
-    rows_V5 = np.array(rows)
-    # A perturbed observation may say anything; the simulator is not made for cars beside the road or faster than light.
-    rows_V5[:, 1] = rows_V5[:, 1].clip(-LANE_WIDTH, scene.lanes * LANE_WIDTH)
-    rows_V5[:, 2] = rows_V5[:, 2].clip(0, _MOST_SPEED)
-    rows_V5[:, 3] = rows_V5[:, 3].clip(-_MOST_SPEED, _MOST_SPEED)
     found_A3 = np.zeros((NUM_ACTIONS, 3))
-    _search(rows_V5, _settings(scene.lanes), _TRIES, WIDTH, DEPTH, found_A3)
+    _search(np.array(rows), _settings(scene.lanes), _TRIES, WIDTH, DEPTH, found_A3)
     return tuple(WayOn(*row) for row in found_A3.tolist())
 
 
