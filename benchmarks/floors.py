@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rapid.evaluation.agents import PLANNERS, open_agent
+from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import run_episodes
 from rapid.evaluation.statistics import Estimate, estimate
@@ -44,19 +44,13 @@ DRIVERS = (
 )
 REWARDS = {"normalized": "", "progress": ":progress"}
 DEPTHS = (1, 2, 3, 4, 5, 6)
-TOGETHER = dict.fromkeys(PLANNERS, 8)
-"""Episodes driven side by side, where it is not all: planners take long, and what takes long shows its progress."""
 
 
 def drive(driver: str, scenario: str, seeds: list[int], commit: str, title: str) -> list[EpisodeRow]:
     """Return the rows of one cell."""
-    rows: list[EpisodeRow] = []
-    size = TOGETHER.get(driver, len(seeds))
     with task(title, len(seeds), "episodes") as progress:
-        for first in range(0, len(seeds), size):
-            agent = open_agent(driver, scenario)
-            episodes = run_episodes(agent, scenario, seeds[first : first + size], progress=progress.advance)
-            rows += episodes.rows(commit=commit)
+        episodes = run_episodes(open_agent(driver, scenario), scenario, seeds, progress=progress.advance)
+        rows = episodes.rows(commit=commit)
         progress.note(f"return {np.mean(column(rows, 'episode_return')):.2f}")
     return rows
 

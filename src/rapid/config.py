@@ -290,7 +290,7 @@ class EvaluateConfig:
     teacher_spawns: int = 16
     """Episodes of the teacher, which is slow; the first of the same seeds. 0 leaves the row out."""
     planner_spawns: int = 200
-    """Episodes of the planner, which takes seconds for each; the first of the same seeds. 0 leaves the row out."""
+    """Episodes of a planner, which takes seconds for each; the first of the same seeds. 0: a run has no such row."""
     curve_spawns: int = 20
     """Episodes of each point of a learning curve, from the set `tune`."""
     attacks: tuple[str, ...] = ("none", "uniform", "gaussian", "fgsm", "pgd")

@@ -23,7 +23,7 @@ from rapid.data.shipped import SHIPPED, shipped_sets
 from rapid.data.transitions import Transitions
 from rapid.engines import check_engine
 from rapid.errors import RapidError, did_you_mean
-from rapid.evaluation.agents import open_agent
+from rapid.evaluation.agents import PLANNERS, open_agent
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
@@ -549,7 +549,7 @@ def _drive(config: Config, scenario: str, spec: str, agent: Any) -> list[Episode
     if spec == TEACHER:
         # A language model takes long over a decision: fewer spawns, and only as it drives undisturbed.
         spawns, attacks = config.evaluate.teacher_spawns, ("none",)
-    elif spec == PLANNER:
+    elif spec in PLANNERS:
         spawns = config.evaluate.planner_spawns
     attacks = [name for name in attacks if is_applicable(agent, name)]
     with task(f"evaluate, {agent.name}", spawns * len(attacks), "episodes") as work:

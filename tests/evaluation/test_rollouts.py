@@ -79,6 +79,14 @@ def test_seeds_driven_in_turns_give_the_same(toy, constant, monkeypatch) -> None
     assert [recording.seed for recording in apart.recordings] == list(range(10))
 
 
+def test_a_planner_shows_its_progress_before_it_has_driven_everything(toy, constant) -> None:
+    agent, ended = constant(FASTER), []
+    agent.kind = "planner"
+    run_episodes(agent, SCENARIO, range(20), progress=ended.append)
+    assert [worlds.count for worlds in toy] == [8, 8, 4]
+    assert sum(ended) == 20
+
+
 def test_agent_sees_the_attack_and_metrics_do_not(toy) -> None:
     watcher = Watcher()
     episodes = run_episodes(watcher, SCENARIO, [10], Noise())

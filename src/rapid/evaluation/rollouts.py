@@ -23,6 +23,8 @@ from rapid.simulator import Simulator
 NO_ATTACK = "none"
 MAX_WORLDS = 256
 """Worlds that are stepped at once; more seeds are driven in turns."""
+PLANNED_WORLDS = 8
+"""The same where a planner drives: it takes so long that its progress should show before all episodes end at once."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +126,9 @@ def run_episodes(
             "agent that reads the worlds themselves sees no observation. Leave this cell out: it is not applicable."
         )
     parts: list[Worlds] = []
-    for first in range(0, len(seeds), MAX_WORLDS):
-        worlds = Worlds(np.asarray(seeds[first : first + MAX_WORLDS], np.int64), record)
+    together = PLANNED_WORLDS if kind_of(agent) == "planner" else MAX_WORLDS
+    for first in range(0, len(seeds), together):
+        worlds = Worlds(np.asarray(seeds[first : first + together], np.int64), record)
         env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, autoreset=False)
         try:
             driver = driver_for(agent, env, generator_seed)
