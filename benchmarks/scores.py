@@ -109,9 +109,14 @@ def offline_with_more_data(config: Config) -> dict[str, Distillation]:
     of = short(MORE_DATA)
     return {
         f"distilled, {of}": Distillation(more, "collected"),
-        f"distilled, {of}, no J_robust": Distillation(without(more, robust_weight=0.0), "collected"),
+        more_distilled(): Distillation(without(more, robust_weight=0.0), "collected"),
         f"CQL, {of}": Distillation(pipeline.baseline(more, "cql"), "collected"),
     }
+
+
+def more_distilled() -> str:
+    """Return the name of what is distilled best from the data that is collected."""
+    return f"distilled, {short(MORE_DATA)}, no J_robust"
 
 
 def without(config: Config, **terms: float) -> Config:
@@ -164,8 +169,7 @@ def online_recipes(
     if more_data:
         # Who begins higher explores no more than the shortest budget does, whatever the steps: else it forgets.
         careful = replace(adaptation(config.recipe, 0), scenario=scenario, steps=steps)
-        origin = f"distilled, {short(MORE_DATA)}, no J_robust"
-        found[f"RAPID, {short(steps)}, from {short(MORE_DATA)}"] = Adaptation(careful, origin, "collected")
+        found[f"RAPID, {short(steps)}, from {short(MORE_DATA)}"] = Adaptation(careful, more_distilled(), "collected")
     return found
 
 
@@ -382,8 +386,10 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
     of = f", {short(MORE_DATA)}"
     more = (
         f"After the name of an offline method, `{of[2:]}` says that it learned from {MORE_DATA} transitions of the "
-        f"teacher and as many random ones in {MORE_ITERATIONS} gradient steps. "
-        if any(of in row.agent for row in rows)
+        f"teacher and as many random ones in {MORE_ITERATIONS} gradient steps. After RAPID's, `from {of[2:]}` says "
+        "that it began from what was so distilled without J_robust, with that data in its batches, and explored no "
+        "more than the shortest budget does, whatever the steps. "
+        if any(row.agent.endswith(of) or f"{of}, " in row.agent for row in rows)
         else ""
     )
     commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for row in rows))
@@ -420,6 +426,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
                 (name, name.replace("RAPID", "online DDQN")),
                 (name, name.replace("RAPID", "online Munchausen DQN")),
             ]
+            if name.endswith(f"from {short(MORE_DATA)}"):
+                pairs.append((name, more_distilled()))
         # An ablation is called after what it ablates.
         pairs += [(whole, name) for whole in clean for name in clean if name.startswith(f"{whole}, ")]
         for name, other in pairs:

@@ -102,6 +102,18 @@ def test_only_what_is_wanted_and_what_it_starts_from_is_trained(benchmark, confi
         benchmark.train(config, "lane-3-density-2", *work, only=["RAPID, 1M"])
 
 
+def test_who_begins_from_more_data_is_careful_for_longer(benchmark, config, tmp_path, asked):
+    scenario, work = "lane-3-density-2:progress", tmp_path / "work"
+    names = ["RAPID, 10K", "RAPID, 10K, from 60K", "RAPID, 100K, from 60K"]
+    benchmark.train(config, scenario, work, scenario, (10_000, 100_000), only=names, more_data=True)
+    usual, more, longer = (asked[name] for name in names)
+    assert more[0] == usual[0]
+    assert longer[0] == replace(more[0], steps=100_000)
+    assert usual[1:] == (work / "distilled" / "agent", work / "mix")
+    origin = work / "distilled-60K-no-J_robust" / "agent"
+    assert more[1:] == longer[1:] == (origin, work / "mix-collected")
+
+
 def test_the_rules_data_takes_the_teachers_place(benchmark, config, tmp_path, asked, monkeypatch):
     mixed, learned = [], {}
     monkeypatch.setattr(benchmark, "datasets", lambda config, data, work, source: (work / source, work / "random"))
