@@ -23,8 +23,9 @@ from rapid.simulator import Simulator
 NO_ATTACK = "none"
 MAX_WORLDS = 256
 """Worlds that are stepped at once; more seeds are driven in turns."""
-PLANNED_WORLDS = 8
-"""The same where a planner drives: it takes so long that its progress should show before all episodes end at once."""
+PLANNED_WORLDS = 1
+"""The same where a planner drives: it takes seconds for an episode and gains nothing from company, and so its progress
+shows after each."""
 
 
 @dataclass(frozen=True)
