@@ -47,7 +47,7 @@ from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import make_teacher
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
-FLOORS = ("slower", "rule", "planner")
+FLOORS = ("slower", "rule", "planner-observation", "planner-cars", "planner")
 SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
 MLP_DISCOUNT = 0.93

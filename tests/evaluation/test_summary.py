@@ -1,6 +1,7 @@
 """The summary table: order, honest cells, aligned text."""
 
 import math
+import re
 from dataclasses import replace
 
 from test_metrics import ROW
@@ -22,13 +23,14 @@ ROWS = [
     *rows_of("slower", "uniform", kind="floor"),
     *rows_of("smollm2", count=1, kind="teacher"),
     *rows_of("planner", kind="planner"),
+    *rows_of("planner-observation", kind="planner"),
 ]
 
 
 def test_order_kinds_and_labels() -> None:
     table = summarize(ROWS, resamples=100)
-    assert [row.label for row in table] == ["always-slower", "smollm2", "planner", "rapid"]
-    assert [row.is_reference for row in table] == [True, True, True, False]
+    assert [row.label for row in table] == ["always-slower", "smollm2", "planner", "planner, as observed", "rapid"]
+    assert [row.is_reference for row in table] == [True, True, True, True, False]
     assert label_of("rapid") == "rapid"
 
 
@@ -37,6 +39,9 @@ def test_cells_say_why_they_are_empty() -> None:
     assert table["slower"].attacks["pgd"].missing == "n/a"
     assert table["planner"].attacks["uniform"].missing == "n/a"
     assert table["rapid"].attacks["uniform"].missing == "–"
+    # It reads an observation, which can be perturbed, but has no network.
+    assert table["planner-observation"].attacks["uniform"].missing == "–"
+    assert table["planner-observation"].attacks["pgd"].missing == "n/a"
     pgd = table["rapid"].attacks["pgd"]
     assert pgd.crashed is not None
     assert pgd.crashed.value == 1
@@ -50,7 +55,7 @@ def test_text_is_aligned_and_complete() -> None:
     assert lines[0] == "lane-3-density-2"
     start = lines[1].index("IQM")
     assert all(line[start - 2 : start] == "  " for line in lines[3:7])
-    assert "always-slower  12.5 [" in text
+    assert re.search(r"always-slower +12\.5 \[", text)
     assert "n/a: a gradient attack needs a network" in text
     assert "95 % bootstrap intervals over 1 to 6 spawn seeds" in text
     assert summary_text([]).startswith("Nothing was measured")

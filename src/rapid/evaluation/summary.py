@@ -135,7 +135,8 @@ def _cell(by_attack: dict[str, list[EpisodeRow]], name: str, needs_gradient: boo
         return AttackCell(_estimate(rows, "episode_return", resamples), _estimate(rows, "crashed", resamples))
     others = [row for of in by_attack.values() for row in of]
     without = needs_gradient and not any(row.has_network for row in others)
-    blind = any(row.kind == "planner" for row in others)
+    # All other planners read the worlds, so there is no observation of theirs to attack.
+    blind = any(row.kind == "planner" and row.agent != "planner-observation" for row in others)
     return AttackCell(None, None, NOT_APPLICABLE if without or blind else NOT_RUN)
 
 
