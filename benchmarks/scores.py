@@ -422,6 +422,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
             pairs += [
                 (name, "slower"),
                 (name, teacher),
+                (name, "planner-observation"),
                 (name, "distilled"),
                 (name, name.replace("RAPID", "online DDQN")),
                 (name, name.replace("RAPID", "online Munchausen DQN")),
