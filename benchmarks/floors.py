@@ -26,7 +26,7 @@ from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import ACTIONS, PAPER_SCENARIOS
 from rapid.simulator import make_vec
-from rapid.simulator.belief import DEPTH, DRAWS
+from rapid.simulator.belief import DEPTH, DRAWS, REACH
 from rapid.simulator.compile import kernel_stamp
 from rapid.simulator.search import WIDTH, unavoidable
 from rapid.spawns import spawn_seeds
@@ -92,10 +92,11 @@ def report(cells: dict[tuple[str, str, str], list[EpisodeRow]], doomed: dict[str
         f"{len(some)} test spawns per cell (seeds {some[0].seed} to {some[-1].seed}), the compiled simulator, dynamics "
         "of `highway-v0`, 30 decisions of one second. Numbers are means with 95 % intervals over the spawns. "
         "`rule` and `rule-forecast` see the observation only and use the checks that a teacher is given; `planner` "
-        f"knows the simulator's true state and searches whole episodes with a beam of {WIDTH}. `planner-cars` sees all "
-        f"cars but draws what their drivers want, {DRAWS} times a decision, and looks {DEPTH} seconds ahead; "
-        "`planner-observation` has the observation alone and draws the cars that it does not show as well. All three "
-        "are references and no bounds: the last two do not foresee that they will know more later.",
+        f"knows the simulator's true state and searches whole episodes with a beam of {WIDTH}. `planner-cars` sees "
+        f"what is from {-REACH[0]:.0f} m behind to {REACH[1]:.0f} m ahead but draws what drivers want, {DRAWS} times "
+        f"a decision, and looks {DEPTH} seconds ahead; `planner-observation` has the observation alone, draws the cars "
+        "that it does not show as well, and pays for driving close. All three are references and no bounds: the last "
+        "two do not foresee that they will know more later. –: not measured.",
         "",
         "Made with: " + " ".join(["python", "benchmarks/floors.py", *sys.argv[1:]]),
         "",

@@ -224,7 +224,8 @@ def train(
             if name in wanted:
                 agents.append((name, home / "agent"))
     for name, (settings, origin, source) in online.items():
-        home, own = work / scenario / file_name(name), replace(offline[origin].settings, adapt=settings)
+        base = offline[origin].settings if source == "collected" else config
+        home, own = work / scenario / file_name(name), replace(base, adapt=settings)
         if name in wanted:
             if not is_trained(home, own, "adapt"):
                 start = work / file_name(origin) / "agent"
@@ -389,7 +390,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         f"teacher and as many random ones in {MORE_ITERATIONS} gradient steps. After RAPID's, `from {of[2:]}` says "
         "that it began from what was so distilled without J_robust, with that data in its batches, and explored no "
         "more than the shortest budget does, whatever the steps. "
-        if any(row.agent.endswith(of) or f"{of}, " in row.agent for row in rows)
+        if any(row.agent.endswith((of, f"from {of[2:]}")) or f"{of}, " in row.agent for row in rows)
         else ""
     )
     commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for row in rows))

@@ -104,6 +104,19 @@ def test_an_observation_is_reconstructed_as_the_world_is() -> None:
     assert (ahead[0, unseen] != ahead[1, unseen]).any()
 
 
+@pytest.mark.parametrize("scenario", ["lane-3-density-2", "lane-5-density-3"])
+def test_no_car_is_drawn_into_another(scenario: str) -> None:
+    env, rng = worlds([7], scenario), np.random.default_rng(0)
+    for _ in range(4):
+        obs_BVF = env.step(np.array([SLOWER]))[0]
+        cars, tags, _ = belief._from_observation(obs_BVF[0].astype(float), env.settings, 20, rng)
+        for own_cars, own_tags in zip(cars, tags, strict=True):
+            for drawn in range(NUM_VEHICLES, own_cars.shape[1]):
+                same_lane = own_tags[TARGET_LANE] == own_tags[TARGET_LANE, drawn]
+                same_lane[drawn] = False
+                assert (np.abs(own_cars[X, same_lane] - own_cars[X, drawn]) > 9.9).all()
+
+
 def test_nothing_is_invented_where_everything_is_seen() -> None:
     obs_VF = np.zeros((NUM_VEHICLES, NUM_FEATURES))
     obs_VF[:2] = [1, 100, 4, 25, 0], [1, 150, 4, 20, 0]

@@ -20,7 +20,7 @@ from rapid.errors import RapidError
 from rapid.scenarios import FEATURES, NUM_FEATURES, NUM_VEHICLES, Scenario, get_scenario
 from rapid.simulator.compile import kernel
 from rapid.simulator.observation import INFO_COLUMNS, SIGHT
-from rapid.simulator.reconstruct import closeness, reconstruct
+from rapid.simulator.reconstruct import LATERAL_TIME, closeness, reconstruct
 from rapid.simulator.search import compiled_worlds, distinct, have_ended, select, tries_of
 from rapid.simulator.settings import Settings, read_settings
 from rapid.simulator.spawn import LANE_WIDTH, TRAFFIC_START_SPEED, nearest_speed_index
@@ -56,14 +56,15 @@ and pay only where the state is exact."""
 CLOSENESS = 0.5
 """What the closest distance costs the planner that has an observation alone, in rewards per second."""
 REACH = (-60.0, 200.0)
-"""Metres from the ego, behind and ahead, beyond which a car cannot matter within `DEPTH` seconds."""
+"""Metres from the ego, behind and ahead, beyond which cars are left out to save time; few could matter in `DEPTH`
+seconds."""
 UNSEEN = 12
 """Cars drawn ahead of the farthest one seen, where the observation has no room for more."""
 
-LATERAL_TIME = 0.6
-"""Seconds over which a lateral offset is steered away; a lateral velocity so tells the lane aimed at."""
-_GAPS = (0.3, 1.7)
-"""Between which the gaps of unseen traffic lie, in mean gaps."""
+_GAPS = (0.9, 1.1)
+"""Between which the gaps of unseen traffic lie, in mean gaps: as it is spawned."""
+_ROOM = 10.0
+"""Metres from one car's centre to the next on a lane of unseen traffic, at least."""
 EXPONENTS = (3.5, 4.5)
 """Between which highway-env draws the exponent of its driver model."""
 
@@ -195,7 +196,8 @@ class ObservationPlanner:
         if seen_BVF.ndim != 3 or seen_BVF.shape[1:] != (NUM_VEHICLES, NUM_FEATURES):
             raise RapidError(
                 f"{self.name} reads observations of shape (worlds, {NUM_VEHICLES}, {NUM_FEATURES}) with the features "
-                f"{', '.join(FEATURES)}, not {seen_BVF.shape}."
+                f"{', '.join(FEATURES)}, not {seen_BVF.shape}. Add the missing axis, or check the "
+                "observation's settings."
             )
         if not np.isfinite(seen_BVF).all():
             raise RapidError(
@@ -210,10 +212,11 @@ class ObservationPlanner:
 
 
 class CarsPlanner:
-    """Knows where every car is, how fast, and which lane it heads for, but not what its driver wants; that is drawn.
+    """Knows where every car within `REACH` is, how fast, and which lane it heads for; what its driver wants is drawn.
 
-    Between :class:`ObservationPlanner` and the planner of :mod:`rapid.simulator.search`, to tell apart what the
-    observation hides from what other drivers do. See the former for the arguments and what is raised. Give it to
+    It stands between :class:`ObservationPlanner` and the planner of :mod:`rapid.simulator.search`, but does not differ
+    from them in knowledge alone: closeness costs it nothing, and it does not look to the end. See the former for the
+    arguments and what is raised. Give it to
     :func:`rapid.evaluation.rollouts.run_episodes`, or call :meth:`bind`.
     """
 
@@ -268,7 +271,7 @@ def _effort(draws: int, width: int, depth: int) -> _Effort:
 
 
 def _endless(settings: Settings, frames: int) -> Settings:
-    """Return the settings with other frames per decision and no time limit: nothing that is seen tells the time."""
+    """Return the settings with other frames per decision and no time limit: no plan foresees the end of an episode."""
     return settings._replace(duration=math.inf, frames=frames, dt=settings.decision_time / frames)
 
 
@@ -320,7 +323,10 @@ def _believed(obs_VF: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _unseen(seen_V5: NDArray[np.float64], count: int, settings: Settings, rng: np.random.Generator) -> Any:
-    """Return traffic beyond the cars seen, as dense as it is spawned and as fast as that seen ahead."""
+    """Return traffic beyond the cars seen, as dense as it is spawned and as fast as that seen ahead.
+
+    Each next car takes a lane at random of those where there is room behind it.
+    """
     rows = np.zeros((count, 5))
     if count:
         farthest = np.abs(seen_V5[:, 0]).max()
@@ -328,8 +334,14 @@ def _unseen(seen_V5: NDArray[np.float64], count: int, settings: Settings, rng: n
         mean, spread = ahead[:, 2].mean(), max(ahead[:, 2].std(), 1.0)
         gap = settings.traffic_spacing * (12.0 + sum(TRAFFIC_START_SPEED) / 2) * settings.spacing_factor
         rows[:, 0] = farthest + np.cumsum(gap * rng.uniform(*_GAPS, count)) - gap * rng.random()
-        rows[:, 0] = rows[:, 0].clip(farthest)
-        rows[:, 4] = rng.integers(settings.lanes, size=count)
+        last = np.full(settings.lanes, -np.inf)
+        for row in seen_V5:
+            last[int(row[4])] = max(last[int(row[4])], row[0])
+        for row in rows:
+            free = np.flatnonzero(last <= row[0] - _ROOM)
+            lane = rng.choice(free) if len(free) else np.argmin(last)
+            row[0] = max(row[0], last[lane] + _ROOM)
+            row[4], last[lane] = lane, row[0]
         rows[:, 1] = LANE_WIDTH * rows[:, 4]
         rows[:, 2] = rng.normal(mean, spread, count).clip(5.0, TRAFFIC_START_SPEED[1])
     return rows

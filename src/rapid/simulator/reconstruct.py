@@ -32,6 +32,9 @@ from rapid.simulator.state import (
 
 STANDSTILL_GAP, GAP_TIME, BRAKING = 3.0, 0.5, 3.0
 """Distance that counts as close: metres, plus seconds of speed, plus what closing in takes to brake away at m/s²."""
+LATERAL_TIME = 0.6
+"""Seconds over which a lateral offset is steered away (``ControlledVehicle.TAU_PURSUIT`` and its lateral gain). A
+lateral velocity so tells the lane aimed at."""
 _CRUISE = (22.5, 24.0)
 """Speeds that traffic is taken to want where nothing is drawn, m/s: it is spawned at 21 to 24."""
 _MOST_SPEED = 40.0

@@ -22,12 +22,11 @@ from rapid.scenarios import (
     SLOWER,
     TARGET_SPEEDS,
 )
+from rapid.simulator.reconstruct import LATERAL_TIME
 
 LANE_WIDTH = 4.0
 CAR_LENGTH = 5.0
 CAR_WIDTH = 2.0
-LATERAL_TIME = 0.6
-"""Seconds over which a lateral offset is steered away (``ControlledVehicle.TAU_PURSUIT`` and its lateral gain)."""
 SIGHT = 200.0
 """Metres beyond which the simulator shows no car; rows that claim more are not believed."""
 
