@@ -163,7 +163,7 @@ def test_bad_input_is_told() -> None:
     agent = ObservationPlanner(SCENARIO, **SMALL)
     with pytest.raises(RapidError, match="shape"):
         agent.act(np.zeros((1, 3, 5), np.float32))
-    with pytest.raises(RapidError, match="not finite"):
+    with pytest.raises(RapidError, match="Observation 0 has nan as presence of row 0, which is not finite"):
         agent.act(np.full((1, NUM_VEHICLES, NUM_FEATURES), np.nan, np.float32))
     with pytest.raises(RapidError, match="planner-observation"):
         open_agent("planner-observations", SCENARIO)

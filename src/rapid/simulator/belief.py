@@ -200,8 +200,10 @@ class ObservationPlanner:
                 "observation's settings."
             )
         if not np.isfinite(seen_BVF).all():
+            world, row, feature = np.argwhere(~np.isfinite(seen_BVF))[0]
             raise RapidError(
-                f"An observation given to {self.name} holds a number that is not finite: check the attack."
+                f"Observation {world} has {seen_BVF[world, row, feature]} as {FEATURES[feature]} of row {row}, "
+                "which is not finite: check the attack or the environment that made it."
             )
         actions = np.zeros(len(obs_BVF), np.int64)
         for i, obs_VF in enumerate(seen_BVF):
@@ -288,7 +290,7 @@ def _decide(worlds: Worlds, settings: Settings, effort: _Effort, caution: float,
 
 
 def _within_reach(cars: NDArray[np.float64], tags: NDArray[np.int64], world: NDArray[np.float64], draws: int) -> Worlds:
-    """Return copies of one world, as many as are drawn, without the cars that are too far away to matter."""
+    """Return copies of one world, as many as are drawn, without the cars out of `REACH`."""
     ahead = cars[X] - cars[X, 0]
     near = np.flatnonzero((ahead >= REACH[0]) & (ahead <= REACH[1]))
     own_cars, own_tags = cars[:, near], tags[:, near]
