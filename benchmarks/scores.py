@@ -58,8 +58,6 @@ MORE_DATA = 60_000
 """Transitions of the teacher, and as many random ones, that `--more-data` collects: four times the shipped ones."""
 MORE_ITERATIONS = 16_000
 """Gradient steps on them."""
-CAREFUL_MUNCHAUSEN = 0.9
-"""Weight of Munchausen's term for who begins from what was so distilled (docs/log.md, the eleventh search)."""
 USUAL_SPAWNS = 200
 """Spawns of the tables that are named without their number."""
 Source = Literal["teacher", "rule", "collected"]
@@ -170,9 +168,7 @@ def online_recipes(
             found[f"RAPID, {short(steps)}, {what}"] = Adaptation(other, "distilled", "teacher")
     if more_data:
         # Who begins higher explores no more than the shortest budget does, whatever the steps: else it forgets.
-        shortest = adaptation(config.recipe, 0)
-        loss = replace(shortest.loss, munchausen_weight=CAREFUL_MUNCHAUSEN)
-        careful = replace(shortest, scenario=scenario, steps=steps, loss=loss)
+        careful = replace(adaptation(config.recipe, 0), scenario=scenario, steps=steps)
         found[f"RAPID, {short(steps)}, from {short(MORE_DATA)}"] = Adaptation(careful, more_distilled(), "collected")
     return found
 
@@ -392,9 +388,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
     more = (
         f"After the name of an offline method, `{of[2:]}` says that it learned from {MORE_DATA} transitions of the "
         f"teacher and as many random ones in {MORE_ITERATIONS} gradient steps. After RAPID's, `from {of[2:]}` says "
-        "that it began from what was so distilled without J_robust, with that data in its batches and "
-        f"`munchausen_weight` {CAREFUL_MUNCHAUSEN}, and explored no more than the shortest budget does, whatever the "
-        "steps. "
+        "that it began from what was so distilled without J_robust, with that data in its batches, and explored no "
+        "more than the shortest budget does, whatever the steps. "
         if any(row.agent.endswith((of, f"from {of[2:]}")) or f"{of}, " in row.agent for row in rows)
         else ""
     )
