@@ -56,3 +56,16 @@ def test_a_failed_task_prints_no_closing_line():
 )
 def test_durations(seconds: float, text: str):
     assert progress.format_seconds(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("done", "total", "text"), [(1_234_567, 1e6, "1234567/1000000 MB"), (3.25, 144.0, "3.2/144 MB")]
+)
+def test_counts_stand_in_full(monkeypatch: pytest.MonkeyPatch, done: float, total: float, text: str):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    stream = io.StringIO()
+    with progress.task("t", total, "MB", stream) as work:
+        now[0] = 6
+        work.advance(done)
+    assert text in stream.getvalue()

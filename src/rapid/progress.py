@@ -50,7 +50,7 @@ class Task:
         """Print the closing line."""
         seconds = time.monotonic() - self._start
         note = f"  {self._note}" if self._note else ""
-        line = f"{self.title}: {self.done:g} {self.unit} in {format_seconds(seconds)}{note}"
+        line = f"{self.title}: {_shown(self.done)} {self.unit} in {format_seconds(seconds)}{note}"
         print(line, file=self._stream, flush=True)
 
     def _print_line(self) -> None:
@@ -60,7 +60,8 @@ class Task:
         left = (now - self._start) / fresh * (self.total - self.done) if fresh > 0 else None
         eta = f"ETA {format_seconds(left)}" if left is not None else "ETA unknown"
         note = f"  {self._note}" if self._note else ""
-        print(f"{self.title}: {self.done:g}/{self.total:g} {self.unit}  {eta}{note}", file=self._stream, flush=True)
+        count = f"{_shown(self.done)}/{_shown(self.total)} {self.unit}"
+        print(f"{self.title}: {count}  {eta}{note}", file=self._stream, flush=True)
 
 
 @contextmanager
@@ -83,6 +84,11 @@ def task(title: str, total: float, unit: str, stream: TextIO | None = None) -> G
             work = Task(title, total, unit, out, bar)
             yield work
     work.finish()
+
+
+def _shown(amount: float) -> str:
+    """Return a count in full, a million steps as 1000000, and parts of megabytes to a tenth."""
+    return f"{round(amount, 1):.15g}"
 
 
 def format_seconds(seconds: float) -> str:
