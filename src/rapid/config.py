@@ -242,11 +242,47 @@ class DistillConfig:
 
 
 @dataclass(frozen=True)
+class PpoConfig:
+    """The second part of phase 3: policy gradients on the return itself (PPO; :mod:`rapid.training.ppo`)."""
+
+    steps: int = 0
+    """Environment steps after those of Q-learning, in whole rollouts; 0 leaves this part out."""
+    num_envs: int = 128
+    """Worlds stepped at once."""
+    rollout: int = 30
+    """Steps of every world between two updates of the policy; 30 is an episode."""
+    epochs: int = 4
+    """Passes over each rollout."""
+    batch_size: int = 512
+    """Transitions in a minibatch."""
+    temperature: float = 0.1
+    """T of the policy that drives, softmax(Q / T); the greedy policy is what is measured."""
+    discount: float = 1.0
+    """gamma. What is measured is the plain sum of rewards, and the critic knows when it ends."""
+    trace: float = 0.95
+    """lambda of generalised advantage estimation."""
+    clip: float = 0.2
+    """How far the probability of an action may move from what it was when it was taken, as a share."""
+    crash_penalty: float = 2.0
+    """What a crash costs more while learning than in the return. In the last second it costs next to nothing there."""
+    critic_steps: int = 38_400
+    """Of the steps, the first ones, in which the critic alone learns."""
+    learning_rate: float = 2e-4
+    """Adam's step size for the policy; falls linearly to zero."""
+    critic_rate: float = 1e-3
+    """Adam's step size for the critic."""
+    max_grad_norm: float = 0.5
+    """The policy's gradients are clipped to this norm."""
+    critic_max_grad_norm: float = 1.0
+    """The critic's gradients are clipped to this norm."""
+
+
+@dataclass(frozen=True)
 class AdaptConfig:
     """Phase 3: online adaptation (paper: section 4.4)."""
 
     steps: int = 10_000
-    """Environment steps, all worlds together."""
+    """Environment steps of Q-learning, all worlds together; 0 leaves it out."""
     num_envs: int = 10
     """Worlds stepped at once; 1 is the paper's setting."""
     updates_per_step: float = 0.2
@@ -279,6 +315,8 @@ class AdaptConfig:
     unlearned faster than driving can correct them."""
     optimizer: OptimizerConfig = field(default_factory=lambda: OptimizerConfig(learning_rate=3e-4, gate_rate=20.0))
     """The optimiser of this phase."""
+    ppo: PpoConfig = field(default_factory=PpoConfig)
+    """What follows the Q-learning."""
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,10 @@ from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import Teacher, check_teacher, make_teacher
 from rapid.teacher.models import is_present
 from rapid.tracking import Tracker, check_tracking
+from rapid.training.diagnostics import Forgetting
 from rapid.training.offline import distill, is_stackable
 from rapid.training.online import adapt
+from rapid.training.ppo import adapt_by_ppo
 from rapid.training.record import CHECKPOINT_FILE, load_metrics
 
 STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
@@ -55,6 +57,8 @@ TEACHER = "teacher"
 """The configured teacher, as an agent to be measured."""
 PLANNER = "planner"
 """Search with the simulator itself as its model: a reference, no bound."""
+PPO = "ppo"
+"""Where, beside the record of phase 3's Q-learning, that of its second part lies."""
 RECORDED = 4
 """Episodes of the adapted agent, and of the teacher, that the report can play."""
 
@@ -428,20 +432,39 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     distilled = load_agent(agent, config.device)
     scenario = config.adapt.scenario or distilled.metadata.get("scenario", config.scenario)
     settings = config.adapt if data else replace(config.adapt, offline_share=0.0)
+    network, seed = distilled.network, stream_seed(config.seed, "adapt")
+    offline = _learnable(load_dataset(data)) if data else None
+    evaluate = _curve(config, scenario, name)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
-    with tracker, task(f"adapt, {name}", settings.steps, "steps") as work:
-        network = adapt(
-            distilled.network,
-            settings,
-            scenario,
-            out,
-            seed=stream_seed(config.seed, "adapt"),
-            offline=_learnable(load_dataset(data)) if data else None,
-            evaluate=_curve(config, scenario, name),
-            progress=work,
-            make_worlds=lambda count: make_vec(scenario, count, simulator=config.simulator),
-            track=tracker.log,
-        )
+    with tracker, task(f"adapt, {name}", settings.steps + settings.ppo.steps, "steps") as work:
+        forgetting = Forgetting(network, offline, seed)
+        if settings.steps:
+            adapt(
+                network,
+                settings,
+                scenario,
+                out,
+                seed=seed,
+                offline=offline,
+                evaluate=evaluate,
+                progress=work,
+                make_worlds=lambda count: make_vec(scenario, count, simulator=config.simulator),
+                track=tracker.log,
+            )
+        if settings.ppo.steps:
+            timed = replace(get_scenario(scenario), clock=True).name
+            adapt_by_ppo(
+                network,
+                settings,
+                scenario,
+                out / PPO,
+                seed=seed,
+                forgetting=forgetting,
+                evaluate=evaluate,
+                progress=work,
+                make_worlds=lambda count: make_vec(timed, count, simulator=config.simulator),
+                track=tracker.log,
+            )
     metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
     save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
     return QAgent(network, name)
@@ -620,7 +643,7 @@ def write_run_report(config: Config, directory: Path) -> Path:
             "offline DQN": load_metrics(directory / "distill" / "offline-dqn"),
             "behaviour cloning": load_metrics(directory / "distill" / "cloning"),
         },
-        adapt={"RAPID": load_metrics(directory / "adapt" / "rapid")},
+        adapt={"RAPID": [row for part in _parts(config, directory / "adapt" / "rapid") for row in load_metrics(part)]},
         routing=_routing(config, directory, recordings),
         recordings=recordings,
         dataset={"driver": teacher_data.drivers, **summary(teacher_data)},
@@ -628,6 +651,12 @@ def write_run_report(config: Config, directory: Path) -> Path:
     )
     write_figures(data, directory / "figures")
     return write_report(data, directory / "report.html")
+
+
+def _parts(config: Config, directory: Path) -> list[Path]:
+    """Where the records of phase 3 lie, in their order."""
+    parts = {directory: config.adapt.steps, directory / PPO: config.adapt.ppo.steps}
+    return [part for part, steps in parts.items() if steps]
 
 
 def _routing(config: Config, directory: Path, recordings: Sequence[Recording]) -> list[RoutingSnapshot]:

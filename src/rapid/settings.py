@@ -34,12 +34,19 @@ LEAST: dict[str, int] = {
     "network.decoder_layers": 1,
     "distill.iterations": 1,
     "distill.evaluate_every": 0,
-    "adapt.steps": 1,
+    "adapt.steps": 0,
     "adapt.num_envs": 1,
     "adapt.evaluate_every": 0,
     "adapt.buffer_size": 1,
     "adapt.learning_starts": 0,
     "adapt.exploration_hold": 1,
+    "adapt.ppo.steps": 0,
+    "adapt.ppo.num_envs": 1,
+    "adapt.ppo.rollout": 1,
+    "adapt.ppo.epochs": 1,
+    "adapt.ppo.batch_size": 1,
+    "adapt.ppo.crash_penalty": 0,
+    "adapt.ppo.critic_steps": 0,
     "teacher.concurrency": 1,
     "teacher.max_turns": 1,
     "teacher.few_shot": 0,
@@ -57,6 +64,17 @@ LEAST: dict[str, int] = {
 POSITIVE = (
     "adapt.updates_per_step",
     *(
+        f"adapt.ppo.{setting}"
+        for setting in (
+            "temperature",
+            "clip",
+            "learning_rate",
+            "critic_rate",
+            "max_grad_norm",
+            "critic_max_grad_norm",
+        )
+    ),
+    *(
         f"{phase}.{setting}"
         for phase in PHASES
         for setting in (
@@ -73,6 +91,8 @@ SHARES = (
     "adapt.exploration_start",
     "adapt.exploration_end",
     "adapt.exploration_share",
+    "adapt.ppo.discount",
+    "adapt.ppo.trace",
     *(f"{phase}.loss.discount" for phase in PHASES),
 )
 """Settings between 0 and 1."""
@@ -163,7 +183,7 @@ def validate(config: Config) -> Config:
     get_scenario(config.scenario)
     if config.adapt.scenario:
         get_scenario(config.adapt.scenario)
-    collect, network = config.collect, config.network
+    collect, network, adapt = config.collect, config.network, config.adapt
     divided = max(collect.workers, collect.shards) > 1
     # Simple bounds first: what follows may divide by them.
     checks: list[tuple[str, bool, str]] = [
@@ -171,6 +191,12 @@ def validate(config: Config) -> Config:
         *((name, value(config, name) > 0, "above 0") for name in POSITIVE),
         *((name, 0 <= value(config, name) <= 1, "between 0 and 1") for name in SHARES),
         ("adapt.offline_share", 0 <= config.adapt.offline_share < 1, "in [0, 1)"),
+        ("adapt.steps", adapt.steps > 0 or adapt.ppo.steps > 0, "above 0 where adapt.ppo.steps is 0"),
+        (
+            "adapt.ppo.steps",
+            adapt.ppo.steps == 0 or adapt.ppo.steps >= adapt.ppo.num_envs * adapt.ppo.rollout,
+            f"0 or at least adapt.ppo.num_envs * adapt.ppo.rollout = {adapt.ppo.num_envs * adapt.ppo.rollout}",
+        ),
         ("seed", 0 <= config.seed < 2**32, "between 0 and 2^32 - 1"),
         ("collect.workers", 1 <= collect.workers <= 1000, "between 1 and 1000"),
         ("collect.shards", 0 <= collect.shards <= 1000, "between 0 and 1000"),

@@ -67,7 +67,8 @@ def adapt(
         directory,
         {
             "phase": "adapt",
-            "config": to_dict(config),
+            # What comes after does not matter here: it may be added once this is done.
+            "config": {name: value for name, value in to_dict(config).items() if name != "ppo"},
             "network": to_dict(network.config),
             "weights": network_fingerprint(network),
             "data": data_fingerprint(offline) if offline is not None else None,

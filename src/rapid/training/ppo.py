@@ -1,0 +1,344 @@
+"""Phase 3, second part: policy gradients on the return itself (PPO; Schulman et al., 2017).
+
+Q-learning discounts, and no observation tells when an episode ends, so what it optimises is not quite what is measured:
+the sum of rewards until the time is up. From what it has found, PPO goes on with just that. The policy is softmax(Q/T),
+so afterwards Q-values are preferences, no longer estimates of a return. The critic, needed in training alone, is told
+the time that the policy does not see (an asymmetric actor-critic; Pinto et al., 2018).
+
+Shapes: T steps of a rollout, W worlds, N = T*W transitions, B a minibatch, V vehicles, F features, A actions.
+"""
+
+import os
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rapid.config import AdaptConfig, NetworkConfig, PpoConfig
+from rapid.errors import RapidError
+from rapid.networks.q_network import QNetwork, build_network, set_phase
+from rapid.progress import Task
+from rapid.scenarios import get_scenario
+from rapid.seeding import numpy_stream, stream_seed, torch_stream
+from rapid.settings import to_dict
+from rapid.training.adam import Adam, clip_norm, flush_denormals
+from rapid.training.diagnostics import Forgetting, gate_size
+from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
+from rapid.training.worlds import Drive, MakeWorlds
+
+VALUE_SCALE = 10.0
+"""By what the critic's output is multiplied: returns of 30 s reach some 30."""
+TERMS = ("policy", "value", "entropy", "kl")
+"""What is recorded of every update; `kl` estimates the divergence from the policy that drove."""
+
+
+class Rollout(NamedTuple):
+    """N transitions of one policy, with what is learned from them."""
+
+    obs_NVF: Tensor
+    """The observation with the time told, as the critic sees it."""
+    action_N: Tensor
+    log_prob_N: Tensor
+    """Of the action, under the policy that drove."""
+    advantage_N: Tensor
+    return_N: Tensor
+    """The critic's target."""
+
+
+@flush_denormals()
+def adapt_by_ppo(
+    network: QNetwork,
+    config: AdaptConfig,
+    scenario: str,
+    directory: str | os.PathLike[str],
+    seed: int,
+    forgetting: Forgetting | None = None,
+    evaluate: Evaluate | None = None,
+    progress: Task | None = None,
+    *,
+    make_worlds: MakeWorlds | None = None,
+    checkpoint_seconds: float = 60.0,
+    track: Track | None = None,
+) -> QNetwork:
+    """Train `network` in place for `config.ppo.steps` and return it; the same call goes on from the last checkpoint.
+
+    Args:
+        network: what phase 3 has taught by Q-learning, or any other network.
+        config: `ppo`, and of the rest what is trained, how often it is measured, and the gate's rate.
+        scenario: where it drives.
+        directory: where ``metrics.jsonl`` and the checkpoint go.
+        seed: of actions, minibatches, traffic and the critic's first weights.
+        forgetting: measures how far the policy still acts as it was distilled; None leaves that out.
+        evaluate: called every `config.evaluate_every` environment steps and at the end.
+        progress: counts environment steps.
+        make_worlds: gives worlds of `scenario` whose observation tells the time; None is `rapid.make_vec`.
+        checkpoint_seconds: time between two checkpoints.
+        track: is given every row of metrics; their steps go on from `config.steps`.
+
+    Raises:
+        RapidError: a loss that is not finite (the last good checkpoint stays), or a directory of another training.
+    """
+    if network.is_stack:
+        raise RapidError("A stack of networks cannot drive. Adapt one network at a time.")
+    ppo = config.ppo
+    per_rollout = ppo.num_envs * ppo.rollout
+    rollouts = ppo.steps // per_rollout
+    told = get_scenario(scenario)
+    sees_clock, clocked = told.clock, replace(told, clock=True).name
+    device = str(next(network.parameters()).device)
+    record = Record(
+        directory,
+        {
+            "phase": "ppo",
+            "config": to_dict(config),
+            "network": to_dict(network.config),
+            "weights": network_fingerprint(network),
+            "scenario": scenario,
+            "seed": seed,
+        },
+        checkpoint_seconds,
+        track,
+    )
+    set_phase(network, "adapt" if config.train == "adapter" else "all", config.freeze_decoder)
+    learner = PpoLearner(network, ppo, config.optimizer.gate_rate, sees_clock, seed, rollouts)
+    drive = Drive(make_worlds or _default_worlds(clocked), ppo.num_envs, stream_seed(seed, "ppo"))
+    sampler = torch_stream(seed, "ppo/actions", device)
+    before = -(-config.steps // config.num_envs) * config.num_envs
+    done = 0
+
+    def state() -> dict[str, Any]:
+        return {
+            "learner": learner.state_dict(),
+            "drive": drive.state_dict(),
+            "sampler": sampler.get_state(),
+            "rollouts": done,
+        }
+
+    if (saved := record.resume()) is not None:
+        learner.load_state_dict(saved["learner"])
+        drive.load_state_dict(saved["drive"])
+        sampler.set_state(saved["sampler"])
+        done = saved["rollouts"]
+        if progress:
+            progress.skip(done * per_rollout)
+
+    while done < rollouts:
+        learner.update(collect(learner, drive, ppo, sampler, device))
+        done += 1
+        steps, last = before + done * per_rollout, done == rollouts
+        row = {
+            "step": steps,
+            "updates": learner.updates,
+            **learner.means(),
+            **drive.means(),
+            "learning_rate": learner.learning_rate,
+            "gate": gate_size(network),
+            "seconds": record.seconds,
+        }
+        if last or crossed(steps, per_rollout, config.evaluate_every):
+            row["agreement"] = forgetting.agreement(network) if forgetting else None
+            if evaluate and config.evaluate_every:
+                row["evaluation"] = evaluate(network, steps)
+        record.write(row)
+        record.checkpoint(state, now=last)
+        if progress:
+            progress.advance(per_rollout)
+            progress.note(f"return {row['return']:.1f}" if row.get("return") is not None else "")
+    drive.close()
+    return network
+
+
+class PpoLearner:
+    """Policy, critic and their optimisers, savable as a whole.
+
+    Args:
+        network: gives the policy; only its parameters that require a gradient are trained.
+        config: the settings.
+        gate_rate: by what the step size of the zero gate is multiplied.
+        sees_clock: whether the policy is told the time, too.
+        seed: of the critic's first weights and the minibatches.
+        rollouts: how many are planned; the policy's step size falls to zero over them.
+    """
+
+    def __init__(
+        self, network: QNetwork, config: PpoConfig, gate_rate: float, sees_clock: bool, seed: int, rollouts: int
+    ) -> None:
+        self.network, self.config, self.planned = network, config, rollouts
+        self._sees_clock = sees_clock
+        device = next(network.parameters()).device
+        self.critic = build_network(_critic(network.config), network.lanes, stream_seed(seed, "ppo/critic")).to(device)
+        self._trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+        self._critics = list(self.critic.parameters())
+        rates = [gate_rate if parameter is network.gate else 1.0 for parameter in self._trained]
+        self._adam, self._critic_adam = Adam(self._trained, rates), Adam(self._critics)
+        self._rng = numpy_stream(seed, "ppo/minibatches")
+        self.rollouts = self.updates = 0
+        self._terms: list[Tensor] = []
+
+    @property
+    def learning_rate(self) -> float:
+        """The policy's step size with the next rollout; 0 while the critic learns what this policy is worth."""
+        if self.rollouts * self.config.num_envs * self.config.rollout < self.config.critic_steps:
+            return 0.0
+        return self.config.learning_rate * max(1 - self.rollouts / self.planned, 0.0)
+
+    def log_probs(self, obs_BVF: Tensor) -> Tensor:
+        """Return the policy's log-probabilities (B, A) = log softmax(Q / T)."""
+        seen_BVF = obs_BVF if self._sees_clock else without_clock(obs_BVF)
+        return (self.network(seen_BVF) / self.config.temperature).log_softmax(1)
+
+    def values(self, obs_BVF: Tensor) -> Tensor:
+        """Return what the critic expects until the end of the episode (B,)."""
+        return VALUE_SCALE * self.critic(obs_BVF).mean(1)
+
+    def update(self, rollout: Rollout) -> None:
+        """Learn from a rollout: several passes over it in minibatches."""
+        rate, count = self.learning_rate, len(rollout.action_N)
+        for _ in range(self.config.epochs):
+            order_N = torch.from_numpy(self._rng.permutation(count)).to(rollout.obs_NVF.device)
+            for rows_B in order_N.split(self.config.batch_size):
+                self._terms.append(self._take_step(Rollout(*(column[rows_B] for column in rollout)), rate))
+                self.updates += 1
+        self.rollouts += 1
+
+    def _take_step(self, batch: Rollout, rate: float) -> Tensor:
+        value = (self.values(batch.obs_NVF) - batch.return_N).div(VALUE_SCALE).square().mean()
+        gradients = torch.autograd.grad(value, self._critics, materialize_grads=True)
+        clip_norm(gradients, self.config.critic_max_grad_norm)
+        self._critic_adam.step(gradients, self.config.critic_rate)
+        if not rate:
+            # The policy stays as it is, so there is nothing to say of it.
+            return torch.stack([torch.zeros_like(value), value.detach(), *torch.zeros(2, device=value.device)])
+        log_prob_BA = self.log_probs(batch.obs_NVF)
+        log_prob_B = log_prob_BA.gather(1, batch.action_N[:, None]).squeeze(1)
+        policy = policy_loss(log_prob_B, batch.log_prob_N, batch.advantage_N, self.config.clip)
+        gradients = torch.autograd.grad(policy, self._trained, materialize_grads=True)
+        clip_norm(gradients, self.config.max_grad_norm)
+        self._adam.step(gradients, rate)
+        with torch.no_grad():
+            entropy = -(log_prob_BA.exp() * log_prob_BA).sum(1).mean()
+            kl = (batch.log_prob_N - log_prob_B).mean()
+        return torch.stack([policy.detach(), value.detach(), entropy, kl])
+
+    def means(self) -> dict[str, float]:
+        """Return the mean of every term over the updates since the last call, and forget them.
+
+        Raises:
+            RapidError: a term or a weight is not finite.
+        """
+        terms_UT = torch.stack(self._terms).cpu()
+        self._terms.clear()
+        trained = (*self._trained, *self._critics)
+        if not terms_UT.isfinite().all() or not all(bool(weight.isfinite().all()) for weight in trained):
+            raise RapidError(
+                f"Training stopped by update {self.updates} of PPO: a loss or a weight is not finite. Lower "
+                "adapt.ppo.learning_rate or adapt.ppo.critic_rate."
+            )
+        return dict(zip(TERMS, terms_UT.double().mean(0).tolist(), strict=True))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that `load_state_dict` needs; call `means` first, the recorded terms are not in it."""
+        return {
+            "network": self.network.state_dict(),
+            "critic": self.critic.state_dict(),
+            "adam": self._adam.state_dict(),
+            "critic_adam": self._critic_adam.state_dict(),
+            "rng": self._rng.bit_generator.state,
+            "rollouts": self.rollouts,
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Become as the learner was whose `state_dict` this is."""
+        self.network.load_state_dict(state["network"])
+        self.critic.load_state_dict(state["critic"])
+        self._adam.load_state_dict(state["adam"])
+        self._critic_adam.load_state_dict(state["critic_adam"])
+        self._rng.bit_generator.state = state["rng"]
+        self.rollouts, self.updates = state["rollouts"], state["updates"]
+
+
+@torch.no_grad()
+def collect(learner: PpoLearner, drive: Drive, config: PpoConfig, generator: torch.Generator, device: str) -> Rollout:
+    """Drive every world for `config.rollout` steps and return what there is to learn.
+
+    A crash costs `config.crash_penalty` more here than in the return that is reported.
+    """
+    obs: list[Tensor] = []
+    actions: list[Tensor] = []
+    log_probs: list[Tensor] = []
+    rewards: list[Tensor] = []
+    ended: list[Tensor] = []
+    for _ in range(config.rollout):
+        obs_WVF = torch.from_numpy(drive.obs_WVF).to(device)
+        log_prob_WA = learner.log_probs(obs_WVF)
+        action_W = torch.multinomial(log_prob_WA.exp(), 1, generator=generator).squeeze(1)
+        _, _, reward_W, _, terminated_W, truncated_W = drive.step(action_W.cpu().numpy())
+        obs.append(obs_WVF)
+        actions.append(action_W)
+        log_probs.append(log_prob_WA.gather(1, action_W[:, None]).squeeze(1))
+        reward_W = reward_W - config.crash_penalty * terminated_W
+        rewards.append(torch.from_numpy(reward_W.astype(np.float32)).to(device))
+        ended.append(torch.from_numpy(terminated_W | truncated_W).to(device))
+    # Nothing comes after an end, so the value of the first state of the next episode is never asked for.
+    last_WVF = torch.from_numpy(drive.obs_WVF).to(device)
+    value_TW = torch.stack([learner.values(obs_WVF) for obs_WVF in [*obs, last_WVF]])
+    reward_TW, ended_TW = torch.stack(rewards), torch.stack(ended)
+    advantage_TW = advantages(reward_TW, value_TW, ended_TW, config.discount, config.trace)
+    return Rollout(
+        torch.cat(obs),
+        torch.cat(actions),
+        torch.cat(log_probs),
+        advantage_TW.flatten(),
+        (advantage_TW + value_TW[:-1]).flatten(),
+    )
+
+
+def advantages(reward_TW: Tensor, value_TW: Tensor, ended_TW: Tensor, discount: float, trace: float) -> Tensor:
+    """Return generalised advantage estimates (T, W) (Schulman et al., 2016: equation 16).
+
+    Args:
+        reward_TW: the rewards.
+        value_TW: the critic's values, (T + 1, W): of the state before each step and after the last.
+        ended_TW: bool: whether the episode ended with this step, by a crash or because the time was up.
+        discount: gamma.
+        trace: lambda.
+    """
+    found_TW = torch.zeros_like(reward_TW)
+    after_W = torch.zeros_like(reward_TW[0])
+    for step in range(len(reward_TW) - 1, -1, -1):
+        on_W = discount * (~ended_TW[step]).to(reward_TW.dtype)
+        error_W = reward_TW[step] + on_W * value_TW[step + 1] - value_TW[step]
+        after_W = error_W + trace * on_W * after_W
+        found_TW[step] = after_W
+    return found_TW
+
+
+def policy_loss(log_prob_B: Tensor, old_log_prob_B: Tensor, advantage_B: Tensor, clip: float) -> Tensor:
+    """Return PPO's clipped objective, to be minimised (Schulman et al., 2017: equation 7).
+
+    Advantages are brought to mean 0 and standard deviation 1 within the minibatch.
+    """
+    advantage_B = (advantage_B - advantage_B.mean()) / (advantage_B.std(correction=0) + 1e-8)
+    ratio_B = (log_prob_B - old_log_prob_B).exp()
+    return -torch.minimum(ratio_B * advantage_B, ratio_B.clamp(1 - clip, 1 + clip) * advantage_B).mean()
+
+
+def without_clock(obs_BVF: Tensor) -> Tensor:
+    """Return observations of a scenario with a clock as those without one give them: the ego's presence is 1."""
+    hidden_BVF = obs_BVF.clone()
+    hidden_BVF[:, 0, 0] = 1
+    return hidden_BVF
+
+
+def _critic(config: NetworkConfig) -> NetworkConfig:
+    """Return the settings of the critic's network: a single policy of the same size, or an MLP."""
+    return replace(config, kind="mlp" if config.kind.startswith("mlp") else "attentive")
+
+
+def _default_worlds(scenario: str) -> MakeWorlds:
+    from rapid.simulator import make_vec
+
+    return lambda count: make_vec(scenario, count)

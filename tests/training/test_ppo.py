@@ -1,0 +1,234 @@
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from test_distill import DATA, Killed, lines, network, weights
+
+from fake_worlds import FakeWorlds
+from rapid.config import AdaptConfig, PpoConfig
+from rapid.errors import RapidError
+from rapid.networks.agent import QAgent
+from rapid.networks.q_network import set_phase
+from rapid.scenarios import FASTER
+from rapid.training import adapt_by_ppo, ppo
+from rapid.training.diagnostics import Forgetting
+from rapid.training.ppo import PpoLearner, advantages, policy_loss, without_clock
+from rapid.training.worlds import Drive
+
+SCENARIO = "lane-3-density-2"
+PPO = PpoConfig(steps=100, num_envs=3, rollout=8, epochs=2, batch_size=10, critic_steps=24)
+CONFIG = AdaptConfig(steps=50, num_envs=10, evaluate_every=48, ppo=PPO)
+"""Four rollouts of 24 steps, of which the first is the critic's alone."""
+
+
+class TimedWorlds(FakeWorlds):
+    """The same worlds with the time in the ego's presence."""
+
+    def _obs(self) -> np.ndarray:
+        obs = super()._obs()
+        obs[:, 0, 0] += self.state[:, 2] / 30
+        return obs
+
+
+class PaidWorlds(TimedWorlds):
+    """FASTER alone is paid, and nobody crashes."""
+
+    def step(self, actions: np.ndarray):
+        # What the sum of actions would have to be before this step to be 0 after it: 673 is 1/3 modulo 1009.
+        self.state[:, 3] = -673 * (actions + 1 + self.state[:, 0])
+        obs, _, crashed, late, info = super().step(actions)
+        return obs, (actions == FASTER).astype(float), crashed, late, info
+
+
+def worlds(count: int) -> FakeWorlds:
+    return TimedWorlds(count, autoreset=True)
+
+
+def train(directory, config=CONFIG, kind="rapid", seed=3, net=None, make_worlds=worlds, **options):
+    torch.set_num_threads(1)
+    net = network(kind) if net is None else net
+    return adapt_by_ppo(net, config, SCENARIO, directory, seed, make_worlds=make_worlds, **options)
+
+
+def test_advantages_are_those_counted_by_hand():
+    reward_TW = torch.tensor([[1.0], [2.0], [3.0]])
+    value_TW = torch.tensor([[0.5], [1.0], [2.0], [4.0]])
+    going_on = torch.zeros(3, 1, dtype=torch.bool)
+    # Errors 1 + 0.5 * 1 - 0.5, 2 + 0.5 * 2 - 1 and 3 + 0.5 * 4 - 2, each later one worth 0.5 * 0.8 of the one before.
+    expected = [[1 + 0.4 * (2 + 0.4 * 3)], [2 + 0.4 * 3], [3.0]]
+    torch.testing.assert_close(advantages(reward_TW, value_TW, going_on, 0.5, 0.8), torch.tensor(expected))
+    ends = torch.tensor([[False], [True], [False]])
+    # Nothing comes after the second step: its error is 2 - 1, and the first one's sum stops there.
+    expected = [[1 + 0.4 * 1], [1.0], [3.0]]
+    torch.testing.assert_close(advantages(reward_TW, value_TW, ends, 0.5, 0.8), torch.tensor(expected))
+
+
+@given(
+    st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.booleans()), min_size=1, max_size=12),
+    st.floats(0, 1),
+    st.floats(-5, 5),
+)
+def test_with_every_trace_kept_an_advantage_is_the_return_less_the_value(steps, discount, last):
+    reward_TW, value_TW, ended_TW = (torch.tensor(column, dtype=torch.float64)[:, None] for column in zip(*steps))
+    ended_TW = ended_TW.bool()
+    value_TW = torch.cat([value_TW, torch.tensor([[last]], dtype=torch.float64)])
+    found = advantages(reward_TW, value_TW, ended_TW, discount, 1.0)
+    after = last
+    for step in range(len(steps) - 1, -1, -1):
+        after = steps[step][0] + (0 if steps[step][2] else discount * after)
+        assert found[step, 0].item() == pytest.approx(after - steps[step][1], abs=1e-9)
+
+
+def test_the_policy_loss_is_that_counted_by_hand():
+    ratio = torch.tensor([1.5, 0.5, 1.1, 0.5])
+    # Of mean 0 and standard deviation 1 as they are.
+    advantage = torch.tensor([1.0, 1.0, -1.0, -1.0])
+    log_prob = ratio.log().requires_grad_()
+    loss = policy_loss(log_prob, torch.zeros(4), advantage, 0.2)
+    # 1.2 for 1.5: no more is gained by going further. 0.5 stays: it may come back. -1.1 stays, -0.8 for -0.5.
+    assert loss.item() == pytest.approx(-(1.2 + 0.5 - 1.1 - 0.8) / 4)
+    (gradient,) = torch.autograd.grad(loss, log_prob)
+    torch.testing.assert_close(gradient, torch.tensor([0.0, -0.5 / 4, 1.1 / 4, 0.0]))
+    # The scale of the advantages does not matter, nor where they lie.
+    assert policy_loss(log_prob, torch.zeros(4), 30 * advantage + 7, 0.2).item() == pytest.approx(loss.item())
+    # Alike, they say nothing.
+    assert policy_loss(log_prob, torch.zeros(4), torch.full((4,), 3.0), 0.2).item() == 0
+
+
+@pytest.mark.parametrize("kind", ["rapid", "mlp"])
+def test_training_twice_is_bit_equal(tmp_path, kind):
+    config = CONFIG if kind == "rapid" else replace(CONFIG, train="all")
+    first, second = (train(tmp_path / f"{i}", config, kind) for i in (1, 2))
+    assert weights(first) == weights(second) != weights(network(kind))
+    assert lines(tmp_path / "1") == lines(tmp_path / "2")
+    assert weights(train(tmp_path / "3", config, kind, seed=4)) != weights(first)
+
+
+@pytest.mark.parametrize("make_worlds", [worlds, None], ids=["fake", "compiled"])
+@pytest.mark.parametrize("stop", [1, 9, 24])
+def test_resumed_equals_uninterrupted(tmp_path, monkeypatch, stop, make_worlds):
+    whole = train(tmp_path / "whole", make_worlds=make_worlds)
+    step, count = PpoLearner._take_step, itertools.count(1)
+
+    def dying(self, batch, rate):
+        if next(count) == stop:
+            raise Killed
+        return step(self, batch, rate)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PpoLearner, "_take_step", dying)
+        with pytest.raises(Killed):
+            train(tmp_path / "cut", make_worlds=make_worlds, checkpoint_seconds=0)
+    resumed = train(tmp_path / "cut", make_worlds=make_worlds)
+    assert weights(resumed) == weights(whole)
+    assert lines(tmp_path / "cut") == lines(tmp_path / "whole")
+
+
+def test_the_distilled_policy_stays_bit_equal_and_the_gate_opens(tmp_path):
+    trained, fresh = train(tmp_path).state_dict(), network().state_dict()
+    same = {name for name, value in trained.items() if torch.equal(value, fresh[name])}
+    assert {name for name in fresh if "policies.0" in name} <= same
+    assert any("gate" in name for name in set(fresh) - same)
+    assert lines(tmp_path)[-1]["gate"] > 0
+
+
+def test_the_policy_waits_until_the_critic_has_learned(tmp_path):
+    patient = replace(CONFIG, ppo=replace(PPO, critic_steps=PPO.steps))
+    trained = train(tmp_path, patient)
+    assert weights(trained) == weights(network())
+    first, *_, last = lines(tmp_path)
+    assert first["value"] > 0
+    assert first["policy"] == first["learning_rate"] == last["learning_rate"] == 0
+    assert [row["learning_rate"] for row in (train(tmp_path / "usual"), lines(tmp_path / "usual"))[1]] == [
+        pytest.approx(PPO.learning_rate * left) for left in (0.75, 0.5, 0.25, 0)
+    ]
+
+
+def test_only_the_critic_is_told_the_time():
+    net = network()
+    set_phase(net, "adapt")
+    obs_BVF = torch.from_numpy(DATA.obs_NVF[:6])
+    late_BVF = obs_BVF.clone()
+    late_BVF[:, 0, 0] = 1.7
+    blind, seeing = (PpoLearner(net, PPO, 1.0, sees_clock, 0, 4) for sees_clock in (False, True))
+    assert torch.equal(blind.log_probs(late_BVF), blind.log_probs(obs_BVF))
+    assert torch.equal(blind.log_probs(late_BVF), seeing.log_probs(without_clock(late_BVF)))
+    assert not torch.equal(seeing.log_probs(late_BVF), seeing.log_probs(obs_BVF))
+    assert not torch.equal(blind.values(late_BVF), blind.values(obs_BVF))
+    # The policy that drives is that of the agent, whose greedy action is the likeliest.
+    greedy_B = QAgent(net, "RAPID").act(obs_BVF.numpy())
+    np.testing.assert_array_equal(greedy_B, blind.log_probs(late_BVF).argmax(1))
+    assert late_BVF[0, 0, 0] == pytest.approx(1.7)
+
+
+def test_a_crash_costs_more_in_learning_than_in_what_is_reported():
+    net = network()
+    set_phase(net, "adapt")
+    found = []
+    for penalty in (0.0, 3.0):
+        config = replace(PPO, crash_penalty=penalty, rollout=30, trace=1.0)
+        drive = Drive(worlds, 3, 1)
+        learner = PpoLearner(net, config, 1.0, False, 0, 4)
+        rollout = ppo.collect(learner, drive, config, torch.Generator().manual_seed(0), "cpu")
+        found.append((rollout, drive.means()))
+    (plain, means), (dear, same) = found
+    assert means == same
+    assert means["crash_share"] > 0
+    # With every trace kept, the target is the return itself: it falls by the penalty wherever a crash follows.
+    lost_N = plain.return_N - dear.return_N
+    assert torch.equal(lost_N.round(decimals=4), 3.0 * (lost_N > 1).float())
+    assert (lost_N > 1).any()
+
+
+def test_it_learns_what_is_paid(tmp_path):
+    sizes = {"steps": 12_000, "num_envs": 20, "rollout": 15, "batch_size": 100, "learning_rate": 3e-3}
+    config = replace(CONFIG, evaluate_every=0, train="all", ppo=replace(PPO, **sizes))
+    trained = train(tmp_path, config, net=network("mlp"), make_worlds=lambda count: PaidWorlds(count, True))
+    rows = lines(tmp_path)
+    returns = [row["return"] for row in rows if row["return"] is not None]
+    assert np.mean(returns[:2]) < 12
+    assert np.mean(returns[-2:]) > 20
+    obs_BVF = torch.from_numpy(DATA.obs_NVF)
+    assert (trained(obs_BVF).argmax(1) == FASTER).double().mean() > 0.9
+    assert rows[-1]["value"] < rows[0]["value"]
+
+
+def test_metrics_go_on_where_q_learning_ended(tmp_path):
+    seen = []
+    forgetting = Forgetting(network(), DATA, 3)
+    train(tmp_path, evaluate=lambda net, steps: {"at": seen.append(steps) or steps}, forgetting=forgetting)
+    rows = lines(tmp_path)
+    assert [row["step"] for row in rows] == [50 + 24 * count for count in range(1, 5)]
+    assert seen == [98, 146]
+    assert [row["updates"] for row in rows] == [6, 12, 18, 24]
+    assert 0 <= rows[-1]["agreement"] <= 1
+    assert "agreement" not in rows[0]
+    assert rows[-1]["entropy"] > 0
+    train(tmp_path / "none")
+    assert lines(tmp_path / "none")[-1]["agreement"] is None
+
+
+def test_what_is_not_finite_stops_it_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch):
+    loss, count = ppo.policy_loss, itertools.count(1)
+
+    def broken(*arguments):
+        return loss(*arguments) * (float("nan") if next(count) == 9 else 1)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo, "policy_loss", broken)
+        with pytest.raises(RapidError, match=r"by update 18 of PPO: a loss or a weight is not finite. Lower"):
+            train(tmp_path, checkpoint_seconds=0)
+    assert [row["updates"] for row in lines(tmp_path)] == [6, 12]
+    assert weights(train(tmp_path)) == weights(train(tmp_path / "whole"))
+
+
+def test_what_does_not_fit_is_refused(tmp_path):
+    train(tmp_path)
+    with pytest.raises(RapidError, match=r"other settings \(config differ\)"):
+        train(tmp_path, replace(CONFIG, ppo=replace(PPO, clip=0.1)))
+    with pytest.raises(RapidError, match="no adapter to train"):
+        train(tmp_path / "adapter", kind="mlp")
