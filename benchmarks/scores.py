@@ -173,6 +173,16 @@ def online_recipes(
     return found
 
 
+def with_ppo(found: dict[str, Adaptation], steps: int) -> dict[str, Adaptation]:
+    """Return how each of these agents goes on by PPO for so many steps, by name."""
+    return {
+        f"{name} + {short(steps)} PPO": Adaptation(
+            replace(adapted.settings, steps=0, ppo=replace(adapted.settings.ppo, steps=steps)), name, adapted.source
+        )
+        for name, adapted in found.items()
+    }
+
+
 def train(
     config: Config,
     data: str,
@@ -182,6 +192,7 @@ def train(
     ablations: bool = False,
     only: Sequence[str] = (),
     more_data: bool = False,
+    ppo: int = 0,
 ) -> list[tuple[str, Path]]:
     """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
 
@@ -194,6 +205,7 @@ def train(
         ablations: whether RAPID is trained without each of its parts as well.
         only: names of the agents wanted; none are all of them.
         more_data: whether agents are trained on data that is collected first as well.
+        ppo: for how many steps every agent trained online goes on by PPO; 0 for none.
 
     Raises:
         RapidError: an agent of `only` does not exist, or one was trained with other settings.
@@ -206,6 +218,8 @@ def train(
     online: dict[str, Adaptation] = {}
     for steps in budgets:
         online |= online_recipes(config, scenario, steps, ablations, more_data)
+    if ppo:
+        online |= with_ppo(online, ppo)
     wanted = list(only) or [*offline, *online]
     for name in wanted:
         if name not in offline and name not in online:
@@ -214,22 +228,26 @@ def train(
                 f"There is no agent '{name}' among {names}. Choose others, or other --steps; some need --ablations or "
                 "--more-data."
             )
+    needed = set(wanted)
+    for name in wanted:
+        while name in online:
+            name = online[name].origin
+            needed.add(name)
     agents: list[tuple[str, Path]] = []
-    origins = {online[name].origin for name in wanted if name in online}
     for name, (settings, source) in offline.items():
         home = work / file_name(name)
-        if name in wanted or name in origins:
-            if not is_trained(home, settings, "distill"):
-                pipeline.distill_agent(settings, mixed(settings, data, work, source), home, name)
-            if name in wanted:
-                agents.append((name, home / "agent"))
-    for name, (settings, origin, source) in online.items():
-        base = offline[origin].settings if source == "collected" else config
-        home, own = work / scenario / file_name(name), replace(base, adapt=settings)
+        if name in needed and not is_trained(home, settings, "distill"):
+            pipeline.distill_agent(settings, mixed(settings, data, work, source), home, name)
         if name in wanted:
-            if not is_trained(home, own, "adapt"):
-                start = work / file_name(origin) / "agent"
-                pipeline.adapt_agent(own, start, mixed(own, data, work, source) if source else None, home, name)
+            agents.append((name, home / "agent"))
+    bases = dict.fromkeys(offline, config)
+    for name, (settings, origin, source) in online.items():
+        bases[name] = offline[origin].settings if source == "collected" and origin in offline else bases[origin]
+        home, own = work / scenario / file_name(name), replace(bases[name], adapt=settings)
+        if name in needed and not is_trained(home, own, "adapt"):
+            start = (work / scenario if origin in online else work) / file_name(origin) / "agent"
+            pipeline.adapt_agent(own, start, mixed(own, data, work, source) if source else None, home, name)
+        if name in wanted:
             agents.append((name, home / "agent"))
     return agents
 
@@ -238,8 +256,8 @@ def adaptation(recipe: str, steps: int) -> AdaptConfig:
     """Return phase 3 for a number of online steps."""
     scale = next(scale for least, scale in reversed(SETTINGS_FROM.items()) if steps >= least)
     usual = preset(recipe, "full").adapt
-    sizes = {"steps": steps, "evaluate_every": usual.evaluate_every, "learning_starts": usual.learning_starts}
-    return replace(preset(recipe, scale).adapt, **sizes)
+    sizes = {"evaluate_every": usual.evaluate_every, "learning_starts": usual.learning_starts}
+    return replace(preset(recipe, scale).adapt, steps=steps, ppo=usual.ppo, **sizes)
 
 
 def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -> bool:
@@ -313,6 +331,11 @@ def datasets(config: Config, scenario: str, work: Path, source: Source) -> tuple
                 save_dataset(relabel(dataset, get_scenario(scenario).reward), folder)
         folders.append(folder)
     return folders[0], folders[1]
+
+
+def ppo_suffix(name: str) -> str:
+    """Return what :func:`with_ppo` put after an agent's name; nothing if it did not."""
+    return name[name.index(" + ") :] if " + " in name else ""
 
 
 def short(steps: int) -> str:
@@ -428,8 +451,10 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
                 (name, name.replace("RAPID", "online DDQN")),
                 (name, name.replace("RAPID", "online Munchausen DQN")),
             ]
-            if name.endswith(f"from {short(MORE_DATA)}"):
+            if name.removesuffix(ppo_suffix(name)).endswith(f"from {short(MORE_DATA)}"):
                 pairs.append((name, more_distilled()))
+            if ppo_suffix(name):
+                pairs.append((name, name.removesuffix(ppo_suffix(name))))
         # An ablation is called after what it ablates.
         pairs += [(whole, name) for whole in clean for name in clean if name.startswith(f"{whole}, ")]
         for name, other in pairs:
@@ -513,6 +538,13 @@ def main() -> None:
         action="store_true",
         help=f"collect {MORE_DATA} transitions of the teacher, and train RAPID and CQL on them as well",
     )
+    parser.add_argument(
+        "--ppo",
+        type=int,
+        default=0,
+        metavar="STEPS",
+        help="let every agent trained online go on by PPO for so many steps, as agents of their own",
+    )
     parser.add_argument("--device", default="cpu", help="where agents are trained; they drive on the CPU")
     parser.add_argument("--only", nargs="+", default=[], help="agents to train and drive, by their names in the table")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
@@ -532,7 +564,8 @@ def main() -> None:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
                 own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
-                agents = train(own, data, home, scenario, chosen.steps, chosen.ablations, chosen.only, chosen.more_data)
+                options = (chosen.ablations, chosen.only, chosen.more_data, chosen.ppo)
+                agents = train(own, data, home, scenario, chosen.steps, *options)
                 measure(own, agents, home, scenario, chosen.spawns, chosen.attacks)
     table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)
 

@@ -15,10 +15,11 @@ import torch
 
 import rapid
 from rapid import pipeline
-from rapid.config import Config, preset
+from rapid.config import Config, PpoConfig, preset
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
 from rapid.settings import apply_overrides
+from rapid.training.record import load_metrics
 
 SMALL = {
     "teacher": {"backend": "scripted", "model": "rule"},
@@ -26,7 +27,12 @@ SMALL = {
     "mix": {"size": 40},
     "network": {"width": 16, "heads": 2, "feedforward": 16},
     "distill": {"iterations": 6, "evaluate_every": 3, "loss": {"robust": {"steps": 2}}},
-    "adapt": {"steps": 40, "learning_starts": 20, "evaluate_every": 20},
+    "adapt": {
+        "steps": 40,
+        "learning_starts": 20,
+        "evaluate_every": 20,
+        "ppo": {"steps": 60, "num_envs": 3, "rollout": 10, "batch_size": 16, "critic_steps": 30},
+    },
     "evaluate": {"spawns": 2, "curve_spawns": 1, "attacks": ["none", "uniform", "pgd"]},
 }
 
@@ -188,6 +194,27 @@ def test_steps_that_cannot_follow_are_refused_before_any_work(
     with pytest.raises(RapidError, match=says):
         pipeline.run(apply_overrides(config, overrides), tmp_path / "run", say=lambda line: None)
     assert not (tmp_path / "run").exists()
+
+
+def test_phase_3_goes_on_by_ppo_from_any_agent(config: Config, finished: Path, tmp_path: Path):
+    first, second = (load_metrics(finished / part) for part in ("adapt/rapid", "adapt/rapid/ppo"))
+    assert [row["step"] for row in (*first, *second)] == [20, 40, 70, 100]
+    # How much is forgotten is told of what was distilled, throughout.
+    assert 0 < first[-1]["agreement"] <= 1
+    page = (finished / "report.html").read_text()
+    assert re.search(r"\[100(\.0)?,", page)
+    # Q-learning first and PPO later is the same as both in one call, and either can be left out.
+    halves = [replace(config, adapt=replace(config.adapt, ppo=PpoConfig()))]
+    halves.append(replace(config, adapt=replace(config.adapt, steps=0)))
+    start, agents = finished / "distill/rapid/agent", []
+    for number, half in enumerate(halves):
+        pipeline.adapt_agent(half, start, finished / "mix", tmp_path / f"{number}")
+        start = tmp_path / f"{number}" / "agent"
+        agents.append(rapid.load_agent(start).network.state_dict())
+    whole = rapid.load_agent(finished / "adapt/rapid/agent").network.state_dict()
+    assert all(whole[name].equal(agents[1][name]) for name in whole)
+    assert any(not whole[name].equal(agents[0][name]) for name in whole)
+    assert not (tmp_path / "1" / "metrics.jsonl").exists()
 
 
 def test_adapting_needs_no_dataset(config: Config, finished: Path, tmp_path: Path):
