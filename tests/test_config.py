@@ -62,6 +62,8 @@ def test_long_adaptation_differs_in_phase_3_alone_and_the_paper_stays_as_printed
     assert preset("paper", "long").adapt == dataclasses.replace(preset("paper", "full").adapt, steps=300_000)
     strong = preset("strong", "long").adapt
     assert (strong.offline_share, strong.loss.conservative_weight, strong.exploration_hold) == (0, 0, 5)
+    assert strong.ppo.steps > 0
+    assert preset("paper", "long").adapt.ppo.steps == preset("strong", "full").adapt.ppo.steps == 0
 
 
 def test_every_field_has_a_docstring():

@@ -2,7 +2,8 @@
 
 A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
 ``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
-``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps).
+``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps; in the
+recipe ``strong``, 700,000 by PPO after them).
 Precedence, low to high: recipe and scale, ``--config FILE.toml``, options (:mod:`rapid.settings`). This module imports
 nothing heavy.
 """
@@ -19,7 +20,9 @@ RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
 
 LONG_STEPS = 300_000
-"""Online steps of the scale `long`."""
+"""Online steps of Q-learning of the scale `long`."""
+LONG_PPO_STEPS = 700_000
+"""The steps by PPO after them, in the recipe `strong`."""
 
 
 @dataclass(frozen=True)
@@ -267,7 +270,7 @@ class PpoConfig:
     """What a crash costs more while learning than in the return. In the last second it costs next to nothing there."""
     critic_steps: int = 38_400
     """Of the steps, the first ones, in which the critic alone learns."""
-    learning_rate: float = 2e-4
+    learning_rate: float = 3e-4
     """Adam's step size for the policy; falls linearly to zero."""
     critic_rate: float = 1e-3
     """Adam's step size for the critic."""
@@ -480,7 +483,10 @@ def _boldly(adapt: AdaptConfig) -> AdaptConfig:
 
 
 def _at_length(adapt: AdaptConfig) -> AdaptConfig:
-    """Return phase 3 for so many steps that it can look further ahead and needs fewer gradient steps for each."""
+    """Return phase 3 for so many steps that it can look further ahead and needs fewer gradient steps for each.
+
+    PPO then brings what it has found up to what is measured.
+    """
     return replace(
         adapt,
         steps=LONG_STEPS,
@@ -488,6 +494,7 @@ def _at_length(adapt: AdaptConfig) -> AdaptConfig:
         updates_per_step=0.1,
         exploration_share=0.3,
         loss=replace(adapt.loss, discount=0.95),
+        ppo=replace(adapt.ppo, steps=LONG_PPO_STEPS),
     )
 
 
