@@ -8,7 +8,8 @@ the data of that one scenario, and adapt to the others. Everything finished is k
 call goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there:
 `scores.parquet` (raw rows) and `scores.md`; `scores-paper` for the recipe `paper`, with the paper's numbers beside
 ours, `scores-progress` for the reward `progress`, `scores-2000` over so many spawns. Of the floors and the planner it
-shows the rows in `floors.parquet`, where they drove the same spawns. With `--more-data` the default teacher, which
+shows the rows in `floors.parquet`, where they drove the same spawns. With `--ppo STEPS` every agent trained online goes
+on by PPO, as another agent. With `--more-data` the default teacher, which
 needs its model, collects four times what is shipped, and RAPID and CQL learn from that for four times as long.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
@@ -295,6 +296,11 @@ def differing(recipe: str) -> str:
     return "".join(told)
 
 
+def flat_ppo(adapt: AdaptConfig) -> str:
+    """Return the settings of PPO, but for its steps, with their values."""
+    return ", ".join(f"`{name}` {value}" for name, value in to_dict(adapt.ppo).items() if name != "steps")
+
+
 def flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
     """Return nested settings by their dotted names."""
     found: dict[str, Any] = {}
@@ -408,6 +414,11 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
     if config.recipe == "paper":
         mlps = "Step, batch and target updates of the baselines as the paper prints them. "
     of = f", {short(MORE_DATA)}"
+    further = (
+        f"`+ … PPO`: so many steps more by PPO, {flat_ppo(config.adapt)}. "
+        if any(ppo_suffix(r.agent) for r in rows)
+        else ""
+    )
     more = (
         f"After the name of an offline method, `{of[2:]}` says that it learned from {MORE_DATA} transitions of the "
         f"teacher and as many random ones in {MORE_ITERATIONS} gradient steps. After RAPID's, `from {of[2:]}` says "
@@ -423,7 +434,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        f"{differing(config.recipe)}{mlps}{more}"
+        f"{differing(config.recipe)}{mlps}{more}{further}"
         f"Last checkpoint, {spawns} test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and "
         "spawns).",
         "",

@@ -102,6 +102,24 @@ def test_only_what_is_wanted_and_what_it_starts_from_is_trained(benchmark, confi
         benchmark.train(config, "lane-3-density-2", *work, only=["RAPID, 1M"])
 
 
+def test_every_agent_goes_on_by_ppo_from_where_it_is(benchmark, config, tmp_path, asked):
+    scenario, work = "lane-3-density-2", tmp_path / "work"
+    names = ["RAPID, 300K + 700K PPO", "online Munchausen DQN, 300K + 700K PPO", "RAPID, 100K, from 60K + 700K PPO"]
+    options = {"more_data": True, "only": names, "ppo": 700_000}
+    agents = benchmark.train(config, scenario, work, scenario, (100_000, 300_000), **options)
+    assert {name for name, _ in agents} == set(names)
+    for name in names:
+        before, after = asked[name.removesuffix(" + 700K PPO")], asked[name]
+        assert before[0].ppo.steps == 0 < before[0].steps
+        assert after[0] == replace(before[0], steps=0, ppo=replace(before[0].ppo, steps=700_000))
+        assert after[1] == work / scenario / benchmark.file_name(name.removesuffix(" + 700K PPO")) / "agent"
+        assert after[2] == before[2]
+    # A policy that began as an MLP from scratch goes on as it is.
+    assert asked[names[1]][0].train == "scratch"
+    assert benchmark.ppo_suffix(names[2]) == " + 700K PPO"
+    assert benchmark.ppo_suffix("RAPID, 300K") == ""
+
+
 def test_who_begins_from_more_data_is_careful_for_longer(benchmark, config, tmp_path, asked):
     scenario, work = "lane-3-density-2:progress", tmp_path / "work"
     names = ["RAPID, 10K", "RAPID, 10K, from 60K", "RAPID, 100K, from 60K"]
