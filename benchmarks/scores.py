@@ -53,6 +53,9 @@ SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
 MLP_DISCOUNT = 0.93
 """Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
+PROGRESS_CRASH_PENALTY = 5.0
+"""What a crash costs more in PPO under `progress`: where all speed is paid, the usual 2 leave more crashes than
+always-slower has (docs/log.md)."""
 RULE_DATA = "distilled, rule data"
 """RAPID distilled from the data of a rule in place of the teacher's, where such data is shipped."""
 MORE_DATA = 60_000
@@ -174,14 +177,19 @@ def online_recipes(
     return found
 
 
-def with_ppo(found: dict[str, Adaptation], steps: int) -> dict[str, Adaptation]:
+def with_ppo(found: dict[str, Adaptation], scenario: str, steps: int) -> dict[str, Adaptation]:
     """Return how each of these agents goes on by PPO for so many steps, by name."""
-    return {
-        f"{name} + {short(steps)} PPO": Adaptation(
-            replace(adapted.settings, steps=0, ppo=replace(adapted.settings.ppo, steps=steps)), name, adapted.source
+    further: dict[str, Adaptation] = {}
+    for name, (settings, _, source) in found.items():
+        ppo = replace(settings.ppo, steps=steps)
+        if get_scenario(scenario).reward == "progress":
+            ppo = replace(ppo, crash_penalty=PROGRESS_CRASH_PENALTY)
+        # Nothing begins anew here, whatever it once began from.
+        train = "all" if settings.train == "scratch" else settings.train
+        further[f"{name} + {short(steps)} PPO"] = Adaptation(
+            replace(settings, steps=0, ppo=ppo, train=train), name, source
         )
-        for name, adapted in found.items()
-    }
+    return further
 
 
 def train(
@@ -220,7 +228,7 @@ def train(
     for steps in budgets:
         online |= online_recipes(config, scenario, steps, ablations, more_data)
     if ppo:
-        online |= with_ppo(online, ppo)
+        online |= with_ppo(online, scenario, ppo)
     wanted = list(only) or [*offline, *online]
     for name in wanted:
         if name not in offline and name not in online:
