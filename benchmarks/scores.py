@@ -133,7 +133,7 @@ class Adaptation(NamedTuple):
 
     settings: AdaptConfig
     origin: str
-    """The agent trained offline that it starts from or, from scratch, whose network it has."""
+    """The agent that it starts from or, from scratch, whose network it has."""
     source: Source | None = None
     """Whose data goes into the online batches, if any."""
 
@@ -234,8 +234,8 @@ def train(
         if name not in offline and name not in online:
             names = ", ".join(f"'{name}'" for name in (*offline, *online))
             raise RapidError(
-                f"There is no agent '{name}' among {names}. Choose others, or other --steps; some need --ablations or "
-                "--more-data."
+                f"There is no agent '{name}' among {names}. Choose others, or other --steps; some need --ablations, "
+                "--more-data or --ppo."
             )
     needed = set(wanted)
     for name in wanted:
@@ -347,6 +347,12 @@ def datasets(config: Config, scenario: str, work: Path, source: Source) -> tuple
     return folders[0], folders[1]
 
 
+def is_ablation(name: str, whole: str) -> bool:
+    """Return whether an agent is another without one of its parts; both may have gone on by PPO."""
+    further = ppo_suffix(whole)
+    return ppo_suffix(name) == further and name.startswith(f"{whole.removesuffix(further)}, ")
+
+
 def ppo_suffix(name: str) -> str:
     """Return what :func:`with_ppo` put after an agent's name; nothing if it did not."""
     return name[name.index(" + ") :] if " + " in name else ""
@@ -432,7 +438,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         f"teacher and as many random ones in {MORE_ITERATIONS} gradient steps. After RAPID's, `from {of[2:]}` says "
         "that it began from what was so distilled without J_robust, with that data in its batches, and explored no "
         "more than the shortest budget does, whatever the steps. "
-        if any(row.agent.endswith((of, f"from {of[2:]}")) or f"{of}, " in row.agent for row in rows)
+        if any(of[2:] in row.agent for row in rows)
         else ""
     )
     commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for row in rows))
@@ -475,7 +481,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
             if ppo_suffix(name):
                 pairs.append((name, name.removesuffix(ppo_suffix(name))))
         # An ablation is called after what it ablates.
-        pairs += [(whole, name) for whole in clean for name in clean if name.startswith(f"{whole}, ")]
+        pairs += [(whole, name) for whole in clean for name in clean if is_ablation(name, whole)]
         for name, other in pairs:
             if other in clean and name in clean:
                 gain = difference(clean[name], clean[other])
@@ -577,6 +583,10 @@ def main() -> None:
     work = chosen.work / chosen.recipe
     if not chosen.table:
         pipeline.check(config)
+        if chosen.ppo:
+            pipeline.check(
+                replace(config, adapt=replace(config.adapt, ppo=replace(config.adapt.ppo, steps=chosen.ppo)))
+            )
         if chosen.teacher:
             measure_teacher(work, chosen.scenarios, chosen.spawns)
         for seed in chosen.seeds:

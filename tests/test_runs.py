@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rapid.config import preset
+from rapid.config import PpoConfig, preset
 from rapid.errors import RapidError
 from rapid.files import read_json
 from rapid.runs import RunDirectory
@@ -48,6 +48,18 @@ def test_where_it_runs_may_change_and_settings_may_be_added(tmp_path: Path):
     RunDirectory(tmp_path, config, STEPS)
     with pytest.raises(RapidError, match=r"collect\.shards: 0 there, 2 now"):
         RunDirectory(tmp_path, replace(config, collect=replace(config.collect, shards=2)), STEPS)
+
+
+def test_a_long_run_from_before_there_was_ppo_had_none(tmp_path: Path):
+    config = preset("strong", "long")
+    without = replace(config, adapt=replace(config.adapt, ppo=PpoConfig()))
+    RunDirectory(tmp_path, without, STEPS)
+    manifest = json.loads((tmp_path / "run.json").read_text())
+    del manifest["config"]["adapt"]["ppo"]
+    (tmp_path / "run.json").write_text(json.dumps(manifest))
+    RunDirectory(tmp_path, without, STEPS)
+    with pytest.raises(RapidError, match=rf"adapt\.ppo\.steps: 0 there, {config.adapt.ppo.steps} now"):
+        RunDirectory(tmp_path, config, STEPS)
 
 
 def test_redoing_from_a_step_keeps_the_earlier_ones(tmp_path: Path):

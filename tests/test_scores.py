@@ -117,6 +117,9 @@ def test_every_agent_goes_on_by_ppo_from_where_it_is(benchmark, config, tmp_path
         assert after[2] == before[2]
     # A policy that began from scratch goes on as it is.
     assert asked[names[1]][0].train == "all"
+    assert benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO", "RAPID, 300K + 700K PPO")
+    assert not benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO", "RAPID, 300K")
+    assert benchmark.is_ablation("RAPID, 300K, from scratch", "RAPID, 300K")
     assert benchmark.ppo_suffix(names[2]) == " + 700K PPO"
     assert benchmark.ppo_suffix("RAPID, 300K") == ""
 

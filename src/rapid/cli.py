@@ -16,7 +16,7 @@ VERBS: dict[str, str] = {
     "relabel": "phase 1: give collected data the scenario's other reward",
     "mix": "phase 1: mix teacher and random transitions into one dataset",
     "distill": "phase 2: offline RL with the robust term, into a policy",
-    "adapt": "phase 3: online DQN in the target scenario, the distilled policy frozen",
+    "adapt": "phase 3: online DQN, then PPO if asked for, in the target scenario; the distilled policy frozen",
     "evaluate": "drive policies and scripted drivers over fixed spawns, clean and attacked",
     "teach-bench": "compare teachers, models and prompt styles on the same spawns",
     "export": "write an agent as ONNX, check it against the original, time it",

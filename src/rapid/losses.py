@@ -1,4 +1,4 @@
-"""The training loss: temporal difference, conservative and robust term (paper: equations 2 to 5).
+"""The training losses: temporal difference, conservative and robust term (paper: equations 2 to 5), and PPO's.
 
 Pure functions of tensors. Shapes: B transitions, V vehicles, F features, A actions.
 """
@@ -123,6 +123,16 @@ def cross_entropy(q_BA: Tensor, labels_BA: Tensor, temperature: float = 1.0, wei
     """
     loss_B = -(labels_BA * (q_BA / temperature).log_softmax(1)).sum(1)
     return loss_B.mean() if weights_B is None else (loss_B * weights_B).sum() / weights_B.sum().clamp_min(1)
+
+
+def policy_gradient_loss(log_prob_B: Tensor, old_log_prob_B: Tensor, advantage_B: Tensor, clip: float) -> Tensor:
+    """Return PPO's clipped objective, to be minimised (Schulman et al., 2017: equation 7).
+
+    Advantages are brought to mean 0 and standard deviation 1 within the minibatch.
+    """
+    advantage_B = (advantage_B - advantage_B.mean()) / (advantage_B.std(correction=0) + 1e-8)
+    ratio_B = (log_prob_B - old_log_prob_B).exp()
+    return -torch.minimum(ratio_B * advantage_B, ratio_B.clamp(1 - clip, 1 + clip) * advantage_B).mean()
 
 
 def behavior_cloning_loss(network: QNetwork, batch: TransitionBatch, teacher_only: bool = False) -> QLoss:

@@ -436,7 +436,9 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     offline = _learnable(load_dataset(data)) if data else None
     evaluate = _curve(config, scenario, name)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
-    with tracker, task(f"adapt, {name}", settings.steps + settings.ppo.steps, "steps") as work:
+    rollout = settings.ppo.num_envs * settings.ppo.rollout
+    total = settings.steps + settings.ppo.steps // rollout * rollout
+    with tracker, task(f"adapt, {name}", total, "steps") as work:
         forgetting = Forgetting(network, offline, seed)
         if settings.steps:
             adapt(
@@ -452,7 +454,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 track=tracker.log,
             )
         if settings.ppo.steps:
-            timed = replace(get_scenario(scenario), clock=True).name
+            timed = replace(get_scenario(scenario), clock=True)
             adapt_by_ppo(
                 network,
                 settings,

@@ -12,12 +12,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import rapid
-from rapid.config import Config, preset, without_place
+from rapid.config import Config, PpoConfig, preset, without_place
 from rapid.errors import RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
 from rapid.settings import apply_overrides, to_dict, to_toml
@@ -109,6 +110,8 @@ class RunDirectory:
         made = manifest["config"]
         # A setting that did not exist when the run was made had the effect that its default has now.
         base = preset(made.get("recipe", config.recipe), made.get("scale", config.scale))
+        # The scale `long` had no PPO before there was any.
+        base = replace(base, adapt=replace(base.adapt, ppo=PpoConfig()))
         there = apply_overrides(base, made, source=f"'{self.path / 'run.json'}'")
         changes = _differences(to_dict(without_place(there)), to_dict(without_place(config)))
         if changes:

@@ -11,7 +11,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from rapid.config import Config
+from rapid.config import Config, PpoConfig
 from rapid.errors import RapidError, did_you_mean
 from rapid.scenarios import get_scenario
 
@@ -44,7 +44,8 @@ LEAST: dict[str, int] = {
     "adapt.ppo.num_envs": 1,
     "adapt.ppo.rollout": 1,
     "adapt.ppo.epochs": 1,
-    "adapt.ppo.batch_size": 1,
+    # An advantage is told by what it is beside others.
+    "adapt.ppo.batch_size": 2,
     "adapt.ppo.crash_penalty": 0,
     "adapt.ppo.critic_steps": 0,
     "teacher.concurrency": 1,
@@ -192,10 +193,13 @@ def validate(config: Config) -> Config:
         *((name, 0 <= value(config, name) <= 1, "between 0 and 1") for name in SHARES),
         ("adapt.offline_share", 0 <= config.adapt.offline_share < 1, "in [0, 1)"),
         ("adapt.steps", adapt.steps > 0 or adapt.ppo.steps > 0, "above 0 where adapt.ppo.steps is 0"),
+        ("adapt.steps", adapt.steps > 0 or adapt.train != "scratch", "above 0 where adapt.train is 'scratch'"),
         (
             "adapt.ppo.steps",
-            adapt.ppo.steps == 0 or adapt.ppo.steps >= adapt.ppo.num_envs * adapt.ppo.rollout,
-            f"0 or at least adapt.ppo.num_envs * adapt.ppo.rollout = {adapt.ppo.num_envs * adapt.ppo.rollout}",
+            adapt.ppo.steps == 0 or adapt.ppo.steps >= least_steps(adapt.ppo),
+            f"0 or at least {least_steps(adapt.ppo)}: until the policy learns, adapt.ppo.critic_steps = "
+            f"{adapt.ppo.critic_steps} in whole rollouts of adapt.ppo.num_envs * adapt.ppo.rollout = "
+            f"{adapt.ppo.num_envs * adapt.ppo.rollout}, and one more",
         ),
         ("seed", 0 <= config.seed < 2**32, "between 0 and 2^32 - 1"),
         ("collect.workers", 1 <= collect.workers <= 1000, "between 1 and 1000"),
@@ -226,6 +230,12 @@ def validate(config: Config) -> Config:
         if not good:
             raise RapidError(f"Setting '{name}' is {value(config, name)}, but must be {expected}.")
     return config
+
+
+def least_steps(ppo: PpoConfig) -> int:
+    """Return the fewest steps of PPO in which the policy learns anything."""
+    per_rollout = max(ppo.num_envs * ppo.rollout, 1)
+    return (-(-ppo.critic_steps // per_rollout) + 1) * per_rollout
 
 
 def value(config: Any, name: str) -> Any:

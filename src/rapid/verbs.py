@@ -159,7 +159,7 @@ class Adapt:
     seed: int = Config.seed
     """Decides the traffic, the exploration and the batches."""
     device: str = Config.device
-    """Torch device; on a CUDA device a gradient step is recorded once and replayed."""
+    """Torch device; on a CUDA device a gradient step of Q-learning is recorded once and replayed."""
     source: Flat[Source] = field(default_factory=Source)
 
 

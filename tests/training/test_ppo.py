@@ -11,12 +11,14 @@ from test_distill import DATA, Killed, lines, network, weights
 from fake_worlds import FakeWorlds
 from rapid.config import AdaptConfig, PpoConfig
 from rapid.errors import RapidError
+from rapid.losses import policy_gradient_loss
 from rapid.networks.agent import QAgent
 from rapid.networks.q_network import set_phase
 from rapid.scenarios import FASTER
+from rapid.simulator import make_vec
 from rapid.training import adapt_by_ppo, ppo
 from rapid.training.diagnostics import Forgetting
-from rapid.training.ppo import PpoLearner, advantages, policy_loss, without_clock
+from rapid.training.ppo import PpoLearner, advantages, without_clock
 from rapid.training.worlds import Drive
 
 SCENARIO = "lane-3-density-2"
@@ -90,15 +92,15 @@ def test_the_policy_loss_is_that_counted_by_hand():
     # Of mean 0 and standard deviation 1 as they are.
     advantage = torch.tensor([1.0, 1.0, -1.0, -1.0])
     log_prob = ratio.log().requires_grad_()
-    loss = policy_loss(log_prob, torch.zeros(4), advantage, 0.2)
+    loss = policy_gradient_loss(log_prob, torch.zeros(4), advantage, 0.2)
     # 1.2 for 1.5: no more is gained by going further. 0.5 stays: it may come back. -1.1 stays, -0.8 for -0.5.
     assert loss.item() == pytest.approx(-(1.2 + 0.5 - 1.1 - 0.8) / 4)
     (gradient,) = torch.autograd.grad(loss, log_prob)
     torch.testing.assert_close(gradient, torch.tensor([0.0, -0.5 / 4, 1.1 / 4, 0.0]))
     # The scale of the advantages does not matter, nor where they lie.
-    assert policy_loss(log_prob, torch.zeros(4), 30 * advantage + 7, 0.2).item() == pytest.approx(loss.item())
+    assert policy_gradient_loss(log_prob, torch.zeros(4), 30 * advantage + 7, 0.2).item() == pytest.approx(loss.item())
     # Alike, they say nothing.
-    assert policy_loss(log_prob, torch.zeros(4), torch.full((4,), 3.0), 0.2).item() == 0
+    assert policy_gradient_loss(log_prob, torch.zeros(4), torch.full((4,), 3.0), 0.2).item() == 0
 
 
 @pytest.mark.parametrize("kind", ["rapid", "mlp"])
@@ -139,15 +141,16 @@ def test_the_distilled_policy_stays_bit_equal_and_the_gate_opens(tmp_path):
 
 
 def test_the_policy_waits_until_the_critic_has_learned(tmp_path):
-    patient = replace(CONFIG, ppo=replace(PPO, critic_steps=PPO.steps))
-    trained = train(tmp_path, patient)
-    assert weights(trained) == weights(network())
-    first, *_, last = lines(tmp_path)
-    assert first["value"] > 0
-    assert first["policy"] == first["learning_rate"] == last["learning_rate"] == 0
-    assert [row["learning_rate"] for row in (train(tmp_path / "usual"), lines(tmp_path / "usual"))[1]] == [
-        pytest.approx(PPO.learning_rate * left) for left in (0.75, 0.5, 0.25, 0)
-    ]
+    seen = []
+    patient = replace(CONFIG, evaluate_every=24, ppo=replace(PPO, critic_steps=60))
+    train(tmp_path, patient, evaluate=lambda net, steps: seen.append(weights(net)) or {})
+    assert len(seen) == 4
+    assert set(seen[:3]) == {weights(network())}
+    assert seen[3] != seen[0]
+    rows = lines(tmp_path)
+    assert [row["learning_rate"] for row in rows] == [0, 0, PPO.learning_rate * 0.25, 0]
+    assert all(row["value"] > 0 for row in rows)
+    assert ["policy" in row for row in rows] == [False, False, False, True]
 
 
 def test_only_the_critic_is_told_the_time():
@@ -165,6 +168,57 @@ def test_only_the_critic_is_told_the_time():
     greedy_B = QAgent(net, "RAPID").act(obs_BVF.numpy())
     np.testing.assert_array_equal(greedy_B, blind.log_probs(late_BVF).argmax(1))
     assert late_BVF[0, 0, 0] == pytest.approx(1.7)
+
+
+def test_the_clock_is_kept_from_the_policy_wherever_the_scenario_does(tmp_path, monkeypatch):
+    told, seen = [], []
+
+    class Watched(PpoLearner):
+        def values(self, obs_BVF):
+            told.append(obs_BVF[:, 0, 0])
+            return super().values(obs_BVF)
+
+        def log_probs(self, obs_BVF):
+            handle = self.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][:, 0, 0]))
+            try:
+                return super().log_probs(obs_BVF)
+            finally:
+                handle.remove()
+
+    monkeypatch.setattr(ppo, "PpoLearner", Watched)
+    for scenario, largest in ((SCENARIO, 1.0), (f"{SCENARIO}:clock", 1.1)):
+        told.clear()
+        seen.clear()
+        adapt_by_ppo(network(), CONFIG, scenario, tmp_path / scenario, 3)
+        assert torch.cat(told).max() > 1.1
+        assert torch.cat(told).min() == 1
+        assert torch.cat(seen).min() == 1
+        assert (torch.cat(seen).max() > largest) == ("clock" in scenario)
+
+
+def test_without_its_clock_a_world_looks_as_one_without():
+    plain, timed = (make_vec(name, 4, autoreset=False) for name in (SCENARIO, f"{SCENARIO}:clock"))
+    seeds = list(range(4))
+    pairs = [(plain.reset(seed=seeds)[0], timed.reset(seed=seeds)[0])]
+    for action in (FASTER, 0, 2):
+        actions = np.full(4, action)
+        pairs.append((plain.step(actions)[0], timed.step(actions)[0]))
+    for first, second in pairs:
+        np.testing.assert_array_equal(first, without_clock(torch.from_numpy(second)).numpy())
+    assert (pairs[-1][1][:, 0, 0] > 1).all()
+
+
+def test_nothing_comes_after_the_time_limit():
+    net = network()
+    set_phase(net, "adapt")
+    config = replace(PPO, rollout=8, num_envs=2)
+    learner = PpoLearner(net, config, 1.0, False, 0, 4)
+    drive = Drive(lambda count: PaidWorlds(count, True, duration=5), 2, 1)
+    rollout = ppo.collect(learner, drive, config, torch.Generator().manual_seed(0), "cpu")
+    paid_TW = (rollout.action_N == FASTER).float().view(8, 2)
+    # Both worlds end with their fifth step: its target is what it paid and no more.
+    torch.testing.assert_close(rollout.return_N.view(8, 2)[4], paid_TW[4])
+    assert (rollout.return_N.view(8, 2)[3] != paid_TW[3]).all()
 
 
 def test_a_crash_costs_more_in_learning_than_in_what_is_reported():
@@ -201,26 +255,28 @@ def test_it_learns_what_is_paid(tmp_path):
 def test_metrics_go_on_where_q_learning_ended(tmp_path):
     seen = []
     forgetting = Forgetting(network(), DATA, 3)
-    train(tmp_path, evaluate=lambda net, steps: {"at": seen.append(steps) or steps}, forgetting=forgetting)
+    seldom = replace(CONFIG, evaluate_every=70)
+    train(tmp_path, seldom, evaluate=lambda net, steps: {"at": seen.append(steps) or steps}, forgetting=forgetting)
     rows = lines(tmp_path)
     assert [row["step"] for row in rows] == [50 + 24 * count for count in range(1, 5)]
-    assert seen == [98, 146]
+    # Where a multiple of 70 was passed, and at the end.
+    assert seen == [74, 146]
     assert [row["updates"] for row in rows] == [6, 12, 18, 24]
     assert 0 <= rows[-1]["agreement"] <= 1
-    assert "agreement" not in rows[0]
+    assert "agreement" not in rows[1]
     assert rows[-1]["entropy"] > 0
     train(tmp_path / "none")
     assert lines(tmp_path / "none")[-1]["agreement"] is None
 
 
 def test_what_is_not_finite_stops_it_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch):
-    loss, count = ppo.policy_loss, itertools.count(1)
+    loss, count = ppo.policy_gradient_loss, itertools.count(1)
 
     def broken(*arguments):
         return loss(*arguments) * (float("nan") if next(count) == 9 else 1)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ppo, "policy_loss", broken)
+        patch.setattr(ppo, "policy_gradient_loss", broken)
         with pytest.raises(RapidError, match=r"by update 18 of PPO: a loss or a weight is not finite. Lower"):
             train(tmp_path, checkpoint_seconds=0)
     assert [row["updates"] for row in lines(tmp_path)] == [6, 12]
@@ -231,5 +287,8 @@ def test_what_does_not_fit_is_refused(tmp_path):
     train(tmp_path)
     with pytest.raises(RapidError, match=r"other settings \(config differ\)"):
         train(tmp_path, replace(CONFIG, ppo=replace(PPO, clip=0.1)))
+    for few in ({"steps": 23}, {"critic_steps": 80}):
+        with pytest.raises(RapidError, match="the policy learns nothing in less than"):
+            train(tmp_path / "few", replace(CONFIG, ppo=replace(PPO, **few)))
     with pytest.raises(RapidError, match="no adapter to train"):
         train(tmp_path / "adapter", kind="mlp")

@@ -137,13 +137,18 @@ class Learner:
         Raises:
             RapidError: it was on another kind of device, whose random numbers go on elsewhere.
         """
-        if len(state["generator"]) != len(self.generator.get_state()):
-            raise RapidError(
-                "The checkpoint was made on another kind of device. Go on with the --device that the training began "
-                "with, or train in another directory."
-            )
+        check_generator(self.generator, state["generator"])
         self.network.load_state_dict(state["network"])
         self.target.load_state_dict(state["target"])
         self._adam.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
         self.updates = state["updates"]
+
+
+def check_generator(generator: torch.Generator, state: Tensor) -> None:
+    """Raise RapidError if `state` is that of a generator on another kind of device, whose numbers go on elsewhere."""
+    if len(state) != len(generator.get_state()):
+        raise RapidError(
+            "The checkpoint was made on another kind of device. Go on with the --device that the training began "
+            "with, or train in another directory."
+        )

@@ -1,4 +1,7 @@
-"""Phase 3: adapt online in the target scenario, the distilled policy frozen (paper: sections 3.3 and 4.4)."""
+"""Phase 3, by Q-learning: adapt online in the target scenario, the distilled policy frozen.
+
+Paper: sections 3.3 and 4.4.
+"""
 
 import os
 from typing import Any

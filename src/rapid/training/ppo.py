@@ -18,20 +18,23 @@ from torch import Tensor
 
 from rapid.config import AdaptConfig, NetworkConfig, PpoConfig
 from rapid.errors import RapidError
+from rapid.losses import policy_gradient_loss
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
-from rapid.scenarios import get_scenario
+from rapid.scenarios import Scenario, get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
-from rapid.settings import to_dict
+from rapid.settings import least_steps, to_dict
 from rapid.training.adam import Adam, clip_norm, flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
+from rapid.training.learner import check_generator
 from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
 from rapid.training.worlds import Drive, MakeWorlds
 
 VALUE_SCALE = 10.0
 """By what the critic's output is multiplied: returns of 30 s reach some 30."""
-TERMS = ("policy", "value", "entropy", "kl")
-"""What is recorded of every update; `kl` estimates the divergence from the policy that drove."""
+TERMS = ("value", "policy", "entropy", "kl")
+"""What is recorded of every update, the first alone while only the critic learns; `kl` estimates how far the policy has
+moved from the one that drove."""
 
 
 class Rollout(NamedTuple):
@@ -70,7 +73,7 @@ def adapt_by_ppo(
         scenario: where it drives.
         directory: where ``metrics.jsonl`` and the checkpoint go.
         seed: of actions, minibatches, traffic and the critic's first weights.
-        forgetting: measures how far the policy still acts as it was distilled; None leaves that out.
+        forgetting: measures how far the policy still acts as it did when phase 3 began; None leaves that out.
         evaluate: called every `config.evaluate_every` environment steps and at the end.
         progress: counts environment steps.
         make_worlds: gives worlds of `scenario` whose observation tells the time; None is `rapid.make_vec`.
@@ -78,15 +81,21 @@ def adapt_by_ppo(
         track: is given every row of metrics; their steps go on from `config.steps`.
 
     Raises:
-        RapidError: a loss that is not finite (the last good checkpoint stays), or a directory of another training.
+        RapidError: steps that teach the policy nothing, a loss that is not finite (the last good checkpoint stays), or
+            a directory of another training.
     """
     if network.is_stack:
         raise RapidError("A stack of networks cannot drive. Adapt one network at a time.")
     ppo = config.ppo
+    if ppo.steps < least_steps(ppo):
+        raise RapidError(
+            f"adapt.ppo.steps is {ppo.steps}, but the policy learns nothing in less than {least_steps(ppo)}: "
+            f"adapt.ppo.critic_steps = {ppo.critic_steps} in whole rollouts, and one more. Raise it."
+        )
     per_rollout = ppo.num_envs * ppo.rollout
+    # No more than asked for: whole rollouts would otherwise go beyond a budget.
     rollouts = ppo.steps // per_rollout
-    told = get_scenario(scenario)
-    sees_clock, clocked = told.clock, replace(told, clock=True).name
+    seen = get_scenario(scenario)
     device = str(next(network.parameters()).device)
     record = Record(
         directory,
@@ -102,8 +111,8 @@ def adapt_by_ppo(
         track,
     )
     set_phase(network, "adapt" if config.train == "adapter" else "all", config.freeze_decoder)
-    learner = PpoLearner(network, ppo, config.optimizer.gate_rate, sees_clock, seed, rollouts)
-    drive = Drive(make_worlds or _default_worlds(clocked), ppo.num_envs, stream_seed(seed, "ppo"))
+    learner = PpoLearner(network, ppo, config.optimizer.gate_rate, seen.clock, seed, rollouts)
+    drive = Drive(make_worlds or _default_worlds(replace(seen, clock=True)), ppo.num_envs, stream_seed(seed, "ppo"))
     sampler = torch_stream(seed, "ppo/actions", device)
     before = -(-config.steps // config.num_envs) * config.num_envs
     done = 0
@@ -117,6 +126,7 @@ def adapt_by_ppo(
         }
 
     if (saved := record.resume()) is not None:
+        check_generator(sampler, saved["sampler"])
         learner.load_state_dict(saved["learner"])
         drive.load_state_dict(saved["drive"])
         sampler.set_state(saved["sampler"])
@@ -209,18 +219,17 @@ class PpoLearner:
         clip_norm(gradients, self.config.critic_max_grad_norm)
         self._critic_adam.step(gradients, self.config.critic_rate)
         if not rate:
-            # The policy stays as it is, so there is nothing to say of it.
-            return torch.stack([torch.zeros_like(value), value.detach(), *torch.zeros(2, device=value.device)])
+            return torch.stack([value.detach()])
         log_prob_BA = self.log_probs(batch.obs_NVF)
         log_prob_B = log_prob_BA.gather(1, batch.action_N[:, None]).squeeze(1)
-        policy = policy_loss(log_prob_B, batch.log_prob_N, batch.advantage_N, self.config.clip)
+        policy = policy_gradient_loss(log_prob_B, batch.log_prob_N, batch.advantage_N, self.config.clip)
         gradients = torch.autograd.grad(policy, self._trained, materialize_grads=True)
         clip_norm(gradients, self.config.max_grad_norm)
         self._adam.step(gradients, rate)
         with torch.no_grad():
             entropy = -(log_prob_BA.exp() * log_prob_BA).sum(1).mean()
             kl = (batch.log_prob_N - log_prob_B).mean()
-        return torch.stack([policy.detach(), value.detach(), entropy, kl])
+        return torch.stack([value.detach(), policy.detach(), entropy, kl])
 
     def means(self) -> dict[str, float]:
         """Return the mean of every term over the updates since the last call, and forget them.
@@ -236,7 +245,7 @@ class PpoLearner:
                 f"Training stopped by update {self.updates} of PPO: a loss or a weight is not finite. Lower "
                 "adapt.ppo.learning_rate or adapt.ppo.critic_rate."
             )
-        return dict(zip(TERMS, terms_UT.double().mean(0).tolist(), strict=True))
+        return dict(zip(TERMS, terms_UT.double().mean(0).tolist(), strict=False))
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that `load_state_dict` needs; call `means` first, the recorded terms are not in it."""
@@ -316,16 +325,6 @@ def advantages(reward_TW: Tensor, value_TW: Tensor, ended_TW: Tensor, discount: 
     return found_TW
 
 
-def policy_loss(log_prob_B: Tensor, old_log_prob_B: Tensor, advantage_B: Tensor, clip: float) -> Tensor:
-    """Return PPO's clipped objective, to be minimised (Schulman et al., 2017: equation 7).
-
-    Advantages are brought to mean 0 and standard deviation 1 within the minibatch.
-    """
-    advantage_B = (advantage_B - advantage_B.mean()) / (advantage_B.std(correction=0) + 1e-8)
-    ratio_B = (log_prob_B - old_log_prob_B).exp()
-    return -torch.minimum(ratio_B * advantage_B, ratio_B.clamp(1 - clip, 1 + clip) * advantage_B).mean()
-
-
 def without_clock(obs_BVF: Tensor) -> Tensor:
     """Return observations of a scenario with a clock as those without one give them: the ego's presence is 1."""
     hidden_BVF = obs_BVF.clone()
@@ -338,7 +337,7 @@ def _critic(config: NetworkConfig) -> NetworkConfig:
     return replace(config, kind="mlp" if config.kind.startswith("mlp") else "attentive")
 
 
-def _default_worlds(scenario: str) -> MakeWorlds:
+def _default_worlds(scenario: Scenario) -> MakeWorlds:
     from rapid.simulator import make_vec
 
     return lambda count: make_vec(scenario, count)
