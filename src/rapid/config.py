@@ -250,13 +250,13 @@ class PpoConfig:
 
     steps: int = 0
     """Environment steps after those of Q-learning, in whole rollouts; 0 leaves this part out."""
-    num_envs: int = 64
+    num_envs: int = 128
     """Worlds stepped at once."""
     rollout: int = 30
     """Steps of every world between two updates of the policy; 30 is an episode."""
     epochs: int = 4
     """Passes over each rollout."""
-    batch_size: int = 256
+    batch_size: int = 512
     """Transitions in a minibatch."""
     temperature: float = 0.1
     """T of the policy that drives, softmax(Q / T); the greedy policy is what is measured."""
