@@ -15,6 +15,7 @@ from rapid.training import offline
 from rapid.training.capture import WARM_UP
 from rapid.training.learner import Learner
 from rapid.training.online import adapt
+from rapid.training.ppo import adapt_by_ppo
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -137,6 +138,12 @@ def test_phase_3_trains_there_and_the_agent_drives_on_a_cpu(transitions, tmp_pat
     config = replace(preset("strong", "tiny").adapt, evaluate_every=0)
     network = build_network(STRONG.network, 3, 0).to("cuda")
     adapt(network, config, SCENARIO, tmp_path / "adapt", 0, transitions)
+    ppo = replace(config.ppo, steps=200, num_envs=4, rollout=10, batch_size=16, critic_steps=40)
+    before = {name: weight.clone() for name, weight in network.state_dict().items()}
+    adapt_by_ppo(network, replace(config, ppo=ppo), SCENARIO, tmp_path / "ppo", 0)
+    same = {name for name, weight in network.state_dict().items() if torch.equal(weight, before[name])}
+    assert {name for name in before if name.startswith("head.mixture.policies.0.")} <= same
+    assert "head.mixture.gate_NV" not in same
     save_agent(tmp_path / "agent", network, {})
     there, here = load_agent(tmp_path / "agent", "cuda"), load_agent(tmp_path / "agent")
     obs_BVF = transitions.obs_NVF[:20]
