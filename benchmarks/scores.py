@@ -282,8 +282,9 @@ def is_trained(home: Path, config: Config, phase: Literal["distill", "adapt"]) -
     saved = apply_overrides(preset(config.recipe, config.scale), written, source=f"the agent in '{home}'")
     for part in ("mix", "network", "distill", phase):
         before, now = (flatten(to_dict(getattr(each, part))) for each in (saved, config))
+        without_ppo = not before.get("ppo.steps") and not now.get("ppo.steps")
         for name, value in now.items():
-            if before[name] != value:
+            if before[name] != value and not (without_ppo and name.startswith("ppo.")):
                 raise RapidError(
                     f"The agent in '{home}' was trained with {part}.{name} = {before[name]}, not {value}. Name another "
                     "--work, or move that directory away."

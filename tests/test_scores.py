@@ -48,6 +48,19 @@ def test_an_agent_counts_as_trained_only_with_the_same_settings(benchmark, confi
         benchmark.is_trained(tmp_path, other, "adapt")
 
 
+def test_how_ppo_is_set_matters_only_where_there_is_some(benchmark, config, tmp_path):
+    def with_ppo(**changes):
+        return replace(config, adapt=replace(config.adapt, ppo=replace(config.adapt.ppo, **changes)))
+
+    write_agent(tmp_path / "without", config, to_dict(config))
+    assert benchmark.is_trained(tmp_path / "without", with_ppo(clip=0.1), "adapt")
+    write_agent(tmp_path / "with", config, to_dict(with_ppo(steps=50_000)))
+    with pytest.raises(RapidError, match=r"adapt\.ppo\.clip = 0\.2, not 0\.1"):
+        benchmark.is_trained(tmp_path / "with", with_ppo(steps=50_000, clip=0.1), "adapt")
+    with pytest.raises(RapidError, match=r"adapt\.ppo\.steps = 50000, not 0"):
+        benchmark.is_trained(tmp_path / "with", config, "adapt")
+
+
 def test_a_setting_that_did_not_exist_yet_had_its_default(benchmark, config, tmp_path):
     settings = to_dict(config)
     del settings["adapt"]["exploration_hold"]
