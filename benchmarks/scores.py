@@ -27,7 +27,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from rapid import pipeline
-from rapid.config import AdaptConfig, Config, TeacherConfig, preset
+from rapid.config import AdaptConfig, Config, PpoConfig, TeacherConfig, preset
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder, shipped_sets
@@ -177,13 +177,18 @@ def online_recipes(
     return found
 
 
+def ppo_settings(adapt: AdaptConfig, scenario: str, steps: int) -> PpoConfig:
+    """Return how PPO goes on in a scenario for so many steps."""
+    ppo = replace(adapt.ppo, steps=steps)
+    progress = get_scenario(scenario).reward == "progress"
+    return replace(ppo, crash_penalty=PROGRESS_CRASH_PENALTY) if progress else ppo
+
+
 def with_ppo(found: dict[str, Adaptation], scenario: str, steps: int) -> dict[str, Adaptation]:
     """Return how each of these agents goes on by PPO for so many steps, by name."""
     further: dict[str, Adaptation] = {}
     for name, (settings, _, source) in found.items():
-        ppo = replace(settings.ppo, steps=steps)
-        if get_scenario(scenario).reward == "progress":
-            ppo = replace(ppo, crash_penalty=PROGRESS_CRASH_PENALTY)
+        ppo = ppo_settings(settings, scenario, steps)
         # Nothing begins anew here, whatever it once began from.
         train = "all" if settings.train == "scratch" else settings.train
         further[f"{name} + {short(steps)} PPO"] = Adaptation(
@@ -305,11 +310,6 @@ def differing(recipe: str) -> str:
     return "".join(told)
 
 
-def flat_ppo(adapt: AdaptConfig) -> str:
-    """Return the settings of PPO, but for its steps, with their values."""
-    return ", ".join(f"`{name}` {value}" for name, value in to_dict(adapt.ppo).items() if name != "steps")
-
-
 def flatten(settings: dict[str, Any], path: str = "") -> dict[str, Any]:
     """Return nested settings by their dotted names."""
     found: dict[str, Any] = {}
@@ -429,10 +429,10 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
     if config.recipe == "paper":
         mlps = "Step, batch and target updates of the baselines as the paper prints them. "
     of = f", {short(MORE_DATA)}"
+    ppo = ppo_settings(config.adapt, rows[0].scenario, 0)
+    ppo_told = ", ".join(f"`{name}` {value}" for name, value in to_dict(ppo).items() if name != "steps")
     further = (
-        f"`+ … PPO`: so many steps more by PPO, {flat_ppo(config.adapt)}. "
-        if any(ppo_suffix(r.agent) for r in rows)
-        else ""
+        f"`+ … PPO`: so many steps more by PPO, {ppo_told}. " if any(ppo_suffix(row.agent) for row in rows) else ""
     )
     more = (
         f"After the name of an offline method, `{of[2:]}` says that it learned from {MORE_DATA} transitions of the "

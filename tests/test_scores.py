@@ -133,6 +133,9 @@ def test_every_agent_goes_on_by_ppo_from_where_it_is(benchmark, config, tmp_path
     assert benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO", "RAPID, 300K + 700K PPO")
     assert not benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO", "RAPID, 300K")
     assert benchmark.is_ablation("RAPID, 300K, from scratch", "RAPID, 300K")
+    assert (
+        benchmark.ppo_settings(config.adapt, f"{scenario}:progress", 9).crash_penalty > config.adapt.ppo.crash_penalty
+    )
     assert benchmark.ppo_suffix(names[2]) == " + 700K PPO"
     assert benchmark.ppo_suffix("RAPID, 300K") == ""
 
