@@ -283,6 +283,17 @@ def test_what_is_not_finite_stops_it_and_the_last_good_checkpoint_stays(tmp_path
     assert weights(train(tmp_path)) == weights(train(tmp_path / "whole"))
 
 
+def test_an_observation_that_is_not_finite_stops_it(tmp_path):
+    class Broken(TimedWorlds):
+        def _obs(self):
+            obs = super()._obs()
+            obs[self.state[:, 2] == 5] = np.nan
+            return obs
+
+    with pytest.raises(RapidError, match="after update 0 of PPO: an observation or a Q-value is not finite"):
+        train(tmp_path, make_worlds=lambda count: Broken(count, autoreset=True))
+
+
 def test_what_does_not_fit_is_refused(tmp_path):
     train(tmp_path)
     with pytest.raises(RapidError, match=r"other settings \(config differ\)"):

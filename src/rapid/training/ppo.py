@@ -274,6 +274,9 @@ def collect(learner: PpoLearner, drive: Drive, config: PpoConfig, generator: tor
     """Drive every world for `config.rollout` steps and return what there is to learn.
 
     A crash costs `config.crash_penalty` more here than in the return that is reported.
+
+    Raises:
+        RapidError: an observation or a Q-value is not finite.
     """
     obs: list[Tensor] = []
     actions: list[Tensor] = []
@@ -283,6 +286,11 @@ def collect(learner: PpoLearner, drive: Drive, config: PpoConfig, generator: tor
     for _ in range(config.rollout):
         obs_WVF = torch.from_numpy(drive.obs_WVF).to(device)
         log_prob_WA = learner.log_probs(obs_WVF)
+        if not log_prob_WA.isfinite().all():
+            raise RapidError(
+                f"Training stopped after update {learner.updates} of PPO: an observation or a Q-value is not finite. The "
+                "worlds are at fault if an observation is; else lower adapt.ppo.learning_rate."
+            )
         action_W = torch.multinomial(log_prob_WA.exp(), 1, generator=generator).squeeze(1)
         _, _, reward_W, _, terminated_W, truncated_W = drive.step(action_W.cpu().numpy())
         obs.append(obs_WVF)
