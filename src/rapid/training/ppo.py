@@ -288,8 +288,8 @@ def collect(learner: PpoLearner, drive: Drive, config: PpoConfig, generator: tor
         log_prob_WA = learner.log_probs(obs_WVF)
         if not log_prob_WA.isfinite().all():
             raise RapidError(
-                f"Training stopped after update {learner.updates} of PPO: an observation or a Q-value is not finite. The "
-                "worlds are at fault if an observation is; else lower adapt.ppo.learning_rate."
+                f"Training stopped after update {learner.updates} of PPO: an observation or a Q-value is not finite. "
+                "The worlds are at fault if an observation is; else lower adapt.ppo.learning_rate."
             )
         action_W = torch.multinomial(log_prob_WA.exp(), 1, generator=generator).squeeze(1)
         _, _, reward_W, _, terminated_W, truncated_W = drive.step(action_W.cpu().numpy())
