@@ -299,7 +299,7 @@ def collect(learner: PpoLearner, drive: Drive, config: PpoConfig, generator: tor
         reward_W = reward_W - config.crash_penalty * terminated_W
         rewards.append(torch.from_numpy(reward_W.astype(np.float32)).to(device))
         ended.append(torch.from_numpy(terminated_W | truncated_W).to(device))
-    # Nothing comes after an end, so the value of the first state of the next episode is never asked for.
+    # After an end comes the next episode, whose first value counts for nothing.
     last_WVF = torch.from_numpy(drive.obs_WVF).to(device)
     value_TW = torch.stack([learner.values(obs_WVF) for obs_WVF in [*obs, last_WVF]])
     reward_TW, ended_TW = torch.stack(rewards), torch.stack(ended)
