@@ -66,6 +66,8 @@ def test_an_exported_agent_drives_the_same(roads, tmp_path):
         {"kind": "rapid", "gate": "tanh", "num_policies": 4, "top_k": 3},
         {"kind": "rapid", "num_policies": 4, "top_k": 1},
         {"kind": "rapid", "num_policies": 1, "top_k": 1},
+        {"kind": "rapid", "mirror": True},
+        {"kind": "mlp", "input": "raw", "mask_absent": False, "mirror": True},
     ],
     ids=str,
 )

@@ -217,6 +217,20 @@ def test_phase_3_goes_on_by_ppo_from_any_agent(config: Config, finished: Path, t
     assert not (tmp_path / "1" / "metrics.jsonl").exists()
 
 
+def test_from_phase_3_on_left_and_right_may_be_made_alike(config: Config, finished: Path, tmp_path: Path):
+    start, found = finished / "distill/rapid/agent", {}
+    for mirror, steps in ((True, 0), (True, 40), (False, 40)):
+        adapt, out = replace(config.adapt, mirror=mirror, steps=steps, ppo=PpoConfig()), tmp_path / f"{mirror}-{steps}"
+        pipeline.adapt_agent(replace(config, adapt=adapt), start, None, out)
+        network = rapid.load_agent(out / "agent").network
+        assert network.config.mirror == mirror
+        found[mirror, steps] = network.state_dict()
+    before = rapid.load_agent(start).network.state_dict()
+    assert all(value.equal(before[name]) for name, value in found[True, 0].items())
+    # It is learned with, too.
+    assert any(not value.equal(found[False, 40][name]) for name, value in found[True, 40].items())
+
+
 def test_adapting_needs_no_dataset(config: Config, finished: Path, tmp_path: Path):
     agent = pipeline.adapt_agent(config, finished / "distill/rapid/agent", None, tmp_path / "adapted")
     assert rapid.load_agent(tmp_path / "adapted" / "agent").name == agent.name

@@ -153,6 +153,9 @@ class NetworkConfig:
     """Zero gate: w1 = omega1, wi = g*omegai; or wi = tanh(g)*omegai, w1 = 1 - sum wi."""
     mask_absent: bool = True
     """Whether rows with presence 0 are hidden from attention, so that their contents never matter."""
+    mirror: bool = False
+    """Average the Q-values with those of the mirrored road, left and right swapped back, which takes twice the time.
+    For the reward `progress`: the paper's pays more on the right."""
 
 
 @dataclass(frozen=True)
@@ -311,6 +314,8 @@ class AdaptConfig:
     """`adapter` is the method: policy 1 frozen. `all` fine-tunes every weight. `scratch` starts from new weights."""
     freeze_decoder: bool = False
     """Also freeze the action decoder."""
+    mirror: bool = False
+    """Set `network.mirror` from this phase on."""
     evaluate_every: int = 1_000
     """Environment steps between two evaluations; 0 is never."""
     loss: LossConfig = field(default_factory=lambda: LossConfig(conservative_weight=0.2, robust_weight=0.0, n_step=3))

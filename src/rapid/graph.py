@@ -18,7 +18,7 @@ from rapid.networks.blocks import Block, Transformer
 from rapid.networks.encoding import BESIDE, NEAR, NEAR_FEATURES
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.mlp import MlpHead
-from rapid.networks.q_network import ActionDecoder, QNetwork, TokenHead
+from rapid.networks.q_network import MIRRORED_ACTIONS, ActionDecoder, QNetwork, TokenHead
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
 
 OPSET, IR_VERSION = 17, 8
@@ -94,20 +94,36 @@ def build_model(network: QNetwork) -> Any:
 
 
 def _q_values(graph: Graph, network: QNetwork) -> str:
+    if not network.config.mirror:
+        return _seen(graph, network, "obs")
+    # The road and its mirror image as one batch.
+    encoding = network.encoding
+    turned = graph.node("Add", graph.node("Mul", "obs", _array(encoding.turned_F)), _array(encoding.far_side_F))
+    present = graph.node("Greater", graph.cut("obs", 0, 1, 2), _array(encoding.absent_V1))
+    both = graph.node("Concat", "obs", graph.node("Where", present, turned, "obs"), axis=0)
+    both = graph.reshape(_seen(graph, network, both), 2, -1, NUM_ACTIONS)
+    actions = graph.constant(MIRRORED_ACTIONS, np.int64)
+    mirrored = graph.node("Gather", graph.cut(both, 1, 2, 0), actions, axis=2)
+    total = graph.node("Add", graph.cut(both, 0, 1, 0), mirrored)
+    return graph.reshape(graph.node("Mul", total, 0.5), -1, NUM_ACTIONS)
+
+
+def _seen(graph: Graph, network: QNetwork, obs: str) -> str:
+    """Return the Q-values (B, A) of observations as they are."""
     head, encoding = network.head, network.encoding
-    features, read_GF = "obs", np.eye(NUM_FEATURES, dtype=np.float32)
+    features, read_GF = obs, np.eye(NUM_FEATURES, dtype=np.float32)
     if encoding.kind == "normalized":
         read_GF /= _array(encoding.scale_F)
     elif encoding.kind in ("ego", "near"):
-        ego = graph.cut("obs", 0, 1, 1)
-        features = graph.node("Sub", "obs", graph.node("Mul", ego, _array(encoding.relative_VF)))
+        ego = graph.cut(obs, 0, 1, 1)
+        features = graph.node("Sub", obs, graph.node("Mul", ego, _array(encoding.relative_VF)))
         read_GF /= _array(encoding.unit_F)
         if encoding.kind == "near":
             features = _near(graph, features)
             read_GF = _read_near(read_GF)
     present = None
     if encoding.mask_absent:
-        present = graph.node("Greater", graph.cut("obs", 0, 1, 2), _array(encoding.absent_V1))
+        present = graph.node("Greater", graph.cut(obs, 0, 1, 2), _array(encoding.absent_V1))
     if not isinstance(head, TokenHead):
         assert isinstance(head, MlpHead)  # agents are never stacks
         if present:

@@ -433,6 +433,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     scenario = config.adapt.scenario or distilled.metadata.get("scenario", config.scenario)
     settings = config.adapt if data else replace(config.adapt, offline_share=0.0)
     network, seed = distilled.network, stream_seed(config.seed, "adapt")
+    if settings.mirror:
+        network.config = replace(network.config, mirror=True)
     offline = _learnable(load_dataset(data)) if data else None
     evaluate = _curve(config, scenario, name)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))

@@ -192,7 +192,11 @@ def validate(config: Config) -> Config:
         *((name, value(config, name) > 0, "above 0") for name in POSITIVE),
         *((name, 0 <= value(config, name) <= 1, "between 0 and 1") for name in SHARES),
         ("adapt.offline_share", 0 <= config.adapt.offline_share < 1, "in [0, 1)"),
-        ("adapt.steps", adapt.steps > 0 or adapt.ppo.steps > 0, "above 0 where adapt.ppo.steps is 0"),
+        (
+            "adapt.steps",
+            adapt.steps > 0 or adapt.ppo.steps > 0 or adapt.mirror,
+            "above 0 where adapt.ppo.steps is 0, unless adapt.mirror",
+        ),
         ("adapt.steps", adapt.steps > 0 or adapt.train != "scratch", "above 0 where adapt.train is 'scratch'"),
         (
             "adapt.ppo.steps",

@@ -58,6 +58,20 @@ def test_without_positions_the_order_of_the_other_vehicles_does_not_matter(roads
         assert torch.allclose(opened, network(obs[:, order]), atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("reading", ["raw", "near"])
+def test_with_the_mirror_left_is_as_good_as_right(roads, kind, reading):
+    obs, plain = roads(6), make(kind=kind, input=reading)
+    network = make(kind=kind, input=reading, mirror=True)
+    assert all(torch.equal(value, plain.state_dict()[key]) for key, value in network.state_dict().items())
+    seen = network.encoding.mirrored(obs)
+    left, idle, right, faster, slower = network(obs).unbind(1)
+    assert torch.allclose(network(seen), torch.stack([right, idle, left, faster, slower], 1), rtol=1e-5, atol=1e-5)
+    expected = (plain(obs)[:, 0] + plain(seen)[:, 2]) / 2
+    assert torch.allclose(left, expected, rtol=1e-5, atol=1e-5)
+    assert not torch.allclose(left, plain(obs)[:, 0])
+
+
 def test_positions_tell_slots_apart(roads):
     obs = roads(3, absent=0)
     order = torch.tensor([0, *range(14, 0, -1)])

@@ -64,6 +64,10 @@ class Encoding(nn.Module):
     """Presence up to which a row is absent."""
     relative_VF: Tensor
     """1 where the ego's feature is taken off, in `ego`."""
+    far_side_F: Tensor
+    """What is added to a feature in the mirror: to y that of the last lane."""
+    turned_F: Tensor
+    """The sign of a feature in the mirror: y and vy are turned round."""
 
     def __init__(self, kind: Literal["raw", "normalized", "ego", "near"], lanes: int, mask_absent: bool) -> None:
         super().__init__()
@@ -76,6 +80,8 @@ class Encoding(nn.Module):
         # Which of the ego's features are taken off: from the others all but presence, from itself x alone.
         kept_VF = torch.tensor([1.0, 0.0, 1.0, 1.0, 1.0]).where(is_ego_V1, torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0]))
         self.register_buffer("relative_VF", 1 - kept_VF, persistent=False)
+        self.register_buffer("far_side_F", torch.tensor([0, 0, LANE_WIDTH * (lanes - 1), 0, 0]), persistent=False)
+        self.register_buffer("turned_F", torch.tensor([1.0, 1.0, -1.0, 1.0, -1.0]), persistent=False)
 
     def forward(self, obs_BVF: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the features (B, V, F), with `near` three more, and the mask (B, 1, 1, V) to add to attention scores.
@@ -88,6 +94,10 @@ class Encoding(nn.Module):
         present_BV1 = obs_BVF[..., :1] > self.absent_V1
         mask_BV = torch.where(present_BV1, 0.0, -torch.inf).squeeze(-1)
         return torch.where(present_BV1, features_BVF, 0.0), mask_BV[:, None, None, :]
+
+    def mirrored(self, obs_BVF: Tensor) -> Tensor:
+        """Return the observations as they would be were left right: y from the other side, and vy turned round."""
+        return torch.where(obs_BVF[..., :1] > self.absent_V1, self.far_side_F + self.turned_F * obs_BVF, obs_BVF)
 
     def _features(self, obs_BVF: Tensor) -> Tensor:
         if self.kind == "raw":

@@ -14,10 +14,13 @@ from rapid.networks.blocks import Transformer
 from rapid.networks.encoding import Encoding
 from rapid.networks.mixture import MixtureOfPolicies
 from rapid.networks.mlp import MlpHead, MlpStack
-from rapid.scenarios import NUM_ACTIONS, NUM_VEHICLES
+from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, NUM_VEHICLES, SLOWER
 from rapid.seeding import torch_stream
 
 Phase = Literal["distill", "adapt", "all"]
+
+MIRRORED_ACTIONS = [LANE_RIGHT, IDLE, LANE_LEFT, FASTER, SLOWER]
+"""Each action as it is seen in the mirror."""
 
 
 class Explanation(NamedTuple):
@@ -80,7 +83,11 @@ class TokenHead(nn.Module):
 
 
 class QNetwork(nn.Module):
-    """Raw observations (B, V, F) in, Q-values (B, A) out; the policy is their argmax."""
+    """Raw observations (B, V, F) in, Q-values (B, A) out; the policy is their argmax.
+
+    With `config.mirror` the Q-values are the mean of those of the road and of its mirror image, so that left and right
+    make no difference. It has no weights, so any network may be given it by another `config`.
+    """
 
     def __init__(self, config: NetworkConfig, lanes: int) -> None:
         super().__init__()
@@ -112,7 +119,11 @@ class QNetwork(nn.Module):
 
     def forward(self, obs_BVF: Tensor) -> Tensor:
         """Return the Q-values (B, A)."""
-        return self.head(*self.encoding(obs_BVF))
+        q_BA = self.head(*self.encoding(obs_BVF))
+        if not self.config.mirror:
+            return q_BA
+        mirrored_BA = self.head(*self.encoding(self.encoding.mirrored(obs_BVF)))
+        return (q_BA + mirrored_BA[:, MIRRORED_ACTIONS]) / 2
 
     @torch.no_grad()
     def explain(self, obs_BVF: Tensor) -> Explanation:
