@@ -9,8 +9,9 @@ call goes on where it was, and calls for other seeds can run beside it. `--table
 `scores.parquet` (raw rows) and `scores.md`; `scores-paper` for the recipe `paper`, with the paper's numbers beside
 ours, `scores-progress` for the reward `progress`, `scores-2000` over so many spawns. Of the floors and the planner it
 shows the rows in `floors.parquet`, where they drove the same spawns. With `--ppo STEPS` every agent trained online goes
-on by PPO, as another agent. With `--more-data` the default teacher, which
-needs its model, collects four times what is shipped, and RAPID and CQL learn from that for four times as long.
+on by PPO, as another agent, and with `--mirror` it is also driven as the mean of itself and its mirror image. With
+`--more-data` the default teacher, which needs its model, collects four times what is shipped, and RAPID and CQL learn
+from that for four times as long.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -56,6 +57,8 @@ MLP_DISCOUNT = 0.93
 PROGRESS_CRASH_PENALTY = 5.0
 """What a crash costs more in PPO under `progress`: where all speed is paid, the usual 2 leave more crashes than
 always-slower has (docs/log.md)."""
+MIRRORED = ", mirrored"
+"""What is put after an agent's name where its Q-values are averaged with those of the mirrored road."""
 RULE_DATA = "distilled, rule data"
 """RAPID distilled from the data of a rule in place of the teacher's, where such data is shipped."""
 MORE_DATA = 60_000
@@ -197,6 +200,16 @@ def with_ppo(found: dict[str, Adaptation], scenario: str, steps: int) -> dict[st
     return further
 
 
+def with_mirror(found: dict[str, Adaptation]) -> dict[str, Adaptation]:
+    """Return these agents with their Q-values averaged with those of the mirrored road, untrained further, by name."""
+    alike: dict[str, Adaptation] = {}
+    for name, (settings, _, _) in found.items():
+        train = "all" if settings.train == "scratch" else settings.train
+        untrained = replace(settings, steps=0, ppo=replace(settings.ppo, steps=0), train=train, mirror=True)
+        alike[f"{name}{MIRRORED}"] = Adaptation(untrained, name)
+    return alike
+
+
 def train(
     config: Config,
     data: str,
@@ -207,6 +220,7 @@ def train(
     only: Sequence[str] = (),
     more_data: bool = False,
     ppo: int = 0,
+    mirror: bool = False,
 ) -> list[tuple[str, Path]]:
     """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
 
@@ -220,6 +234,7 @@ def train(
         only: names of the agents wanted; none are all of them.
         more_data: whether agents are trained on data that is collected first as well.
         ppo: for how many steps every agent trained online goes on by PPO; 0 for none.
+        mirror: whether every agent trained online is made alike to left and right as well.
 
     Raises:
         RapidError: an agent of `only` does not exist, or one was trained with other settings.
@@ -234,13 +249,15 @@ def train(
         online |= online_recipes(config, scenario, steps, ablations, more_data)
     if ppo:
         online |= with_ppo(online, scenario, ppo)
+    if mirror:
+        online |= with_mirror(online)
     wanted = list(only) or [*offline, *online]
     for name in wanted:
         if name not in offline and name not in online:
             names = ", ".join(f"'{name}'" for name in (*offline, *online))
             raise RapidError(
                 f"There is no agent '{name}' among {names}. Choose others, or other --steps; some need --ablations, "
-                "--more-data or --ppo."
+                "--more-data, --ppo or --mirror."
             )
     needed = set(wanted)
     for name in wanted:
@@ -351,6 +368,8 @@ def datasets(config: Config, scenario: str, work: Path, source: Source) -> tuple
 def is_ablation(name: str, whole: str) -> bool:
     """Return whether an agent is another without one of its parts; both may have gone on by PPO."""
     further = ppo_suffix(whole)
+    if name.endswith(MIRRORED) and not whole.endswith(MIRRORED):
+        return False
     return ppo_suffix(name) == further and name.startswith(f"{whole.removesuffix(further)}, ")
 
 
@@ -442,6 +461,11 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         if any(of[2:] in row.agent for row in rows)
         else ""
     )
+    alike = (
+        f"`{MIRRORED[2:]}`: the Q-values averaged with those of the mirrored road, without further training. "
+        if any(row.agent.endswith(MIRRORED) for row in rows)
+        else ""
+    )
     commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for row in rows))
     lines = [
         "# Scores",
@@ -449,7 +473,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        f"{differing(config.recipe)}{mlps}{more}{further}"
+        f"{differing(config.recipe)}{mlps}{more}{further}{alike}"
         f"Last checkpoint, {spawns} test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and "
         "spawns).",
         "",
@@ -481,6 +505,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
                 pairs.append((name, more_distilled()))
             if ppo_suffix(name):
                 pairs.append((name, name.removesuffix(ppo_suffix(name))))
+            if name.endswith(MIRRORED):
+                pairs.append((name, name.removesuffix(MIRRORED)))
         # An ablation is called after what it ablates.
         pairs += [(whole, name) for whole in clean for name in clean if is_ablation(name, whole)]
         for name, other in pairs:
@@ -571,6 +597,12 @@ def main() -> None:
         metavar="STEPS",
         help="let every agent trained online go on by PPO for so many steps, as agents of their own",
     )
+    parser.add_argument(
+        "--mirror",
+        action="store_true",
+        help="average the Q-values of every agent trained online with those of the mirrored road, as agents of their "
+        "own; for the reward progress",
+    )
     parser.add_argument("--device", default="cpu", help="where agents are trained; they drive on the CPU")
     parser.add_argument("--only", nargs="+", default=[], help="agents to train and drive, by their names in the table")
     parser.add_argument("--data", default="", choices=PAPER_SCENARIOS, help="learn offline from this scenario for all")
@@ -594,7 +626,7 @@ def main() -> None:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
                 own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
-                options = (chosen.ablations, chosen.only, chosen.more_data, chosen.ppo)
+                options = (chosen.ablations, chosen.only, chosen.more_data, chosen.ppo, chosen.mirror)
                 agents = train(own, data, home, scenario, chosen.steps, *options)
                 measure(own, agents, home, scenario, chosen.spawns, chosen.attacks)
     table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)

@@ -140,6 +140,21 @@ def test_every_agent_goes_on_by_ppo_from_where_it_is(benchmark, config, tmp_path
     assert benchmark.ppo_suffix("RAPID, 300K") == ""
 
 
+def test_the_mirror_is_put_before_what_is_there(benchmark, config, tmp_path, asked):
+    scenario, whole = "lane-3-density-2:progress", "RAPID, 300K + 700K PPO"
+    names = ["online DDQN, 100K, mirrored", f"{whole}, mirrored"]
+    options = {"only": names, "ppo": 700_000, "mirror": True}
+    agents = benchmark.train(config, scenario, tmp_path, scenario, (100_000, 300_000), **options)
+    assert {name for name, _ in agents} == set(names)
+    for name in names:
+        settings, start, data = asked[name]
+        assert (settings.steps, settings.ppo.steps, settings.mirror, data) == (0, 0, True, None)
+        assert start == tmp_path / scenario / benchmark.file_name(name.removesuffix(", mirrored")) / "agent"
+    assert asked[names[0]][0].train == "all"
+    assert not benchmark.is_ablation(names[1], whole)
+    assert benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO, mirrored", f"{whole}, mirrored")
+
+
 def test_who_begins_from_more_data_is_careful_for_longer(benchmark, config, tmp_path, asked):
     scenario, work = "lane-3-density-2:progress", tmp_path / "work"
     names = ["RAPID, 10K", "RAPID, 10K, from 60K", "RAPID, 100K, from 60K"]
