@@ -44,6 +44,12 @@ CASES = {
     "strong": (STRONG, STRONG.distill.loss, STRONG.distill.optimizer, "distill"),
     "paper": (PAPER, PAPER.distill.loss, PAPER.distill.optimizer, "distill"),
     "adapt": (STRONG, preset("strong", "long").adapt.loss, STRONG.adapt.optimizer, "adapt"),
+    "mirror": (
+        replace(STRONG, network=replace(STRONG.network, mirror=True)),
+        STRONG.distill.loss,
+        STRONG.distill.optimizer,
+        "distill",
+    ),
     "bc": (STRONG, STRONG.distill.loss, replace(STRONG.distill.optimizer, algorithm="bc"), "distill"),
     "mlp": (
         replace(PAPER, network=replace(PAPER.network, kind="mlp")),

@@ -89,12 +89,17 @@ class QNetwork(nn.Module):
     make no difference. It has no weights, so any network may be given it by another `config`.
     """
 
+    mirrored_A: Tensor
+    """:data:`MIRRORED_ACTIONS`."""
+
     def __init__(self, config: NetworkConfig, lanes: int) -> None:
         super().__init__()
         self.config, self.lanes = config, lanes
         self.encoding = Encoding(config.input, lanes, config.mask_absent)
         self.head: TokenHead | MlpHead | MlpStack
         self.head = TokenHead(config) if config.kind in ("rapid", "attentive") else MlpHead(config)
+        # A buffer, for a list of indices would be copied to the device at every call.
+        self.register_buffer("mirrored_A", torch.tensor(MIRRORED_ACTIONS), persistent=False)
 
     @property
     def is_stack(self) -> bool:
@@ -123,7 +128,7 @@ class QNetwork(nn.Module):
         if not self.config.mirror:
             return q_BA
         mirrored_BA = self.head(*self.encoding(self.encoding.mirrored(obs_BVF)))
-        return (q_BA + mirrored_BA[:, MIRRORED_ACTIONS]) / 2
+        return (q_BA + mirrored_BA.index_select(1, self.mirrored_A)) / 2
 
     @torch.no_grad()
     def explain(self, obs_BVF: Tensor) -> Explanation:
