@@ -366,16 +366,16 @@ def datasets(config: Config, scenario: str, work: Path, source: Source) -> tuple
 
 
 def is_ablation(name: str, whole: str) -> bool:
-    """Return whether an agent is another without one of its parts; both may have gone on by PPO."""
-    further = ppo_suffix(whole)
-    if name.endswith(MIRRORED) and not whole.endswith(MIRRORED):
-        return False
-    return ppo_suffix(name) == further and name.startswith(f"{whole.removesuffix(further)}, ")
+    """Return whether an agent is another without one of its parts; both may have gone on by PPO, or be mirrored."""
+    (own, *later), (origin, *further) = name_parts(name), name_parts(whole)
+    return later == further and own.startswith(f"{origin}, ")
 
 
-def ppo_suffix(name: str) -> str:
-    """Return what :func:`with_ppo` put after an agent's name; nothing if it did not."""
-    return name[name.index(" + ") :] if " + " in name else ""
+def name_parts(name: str) -> tuple[str, str, str]:
+    """Return an agent's name as :func:`with_ppo` and :func:`with_mirror` found it, and what each has put after it."""
+    trained = name.removesuffix(MIRRORED)
+    origin = trained.partition(" + ")[0]
+    return origin, trained[len(origin) :], name[len(trained) :]
 
 
 def short(steps: int) -> str:
@@ -450,8 +450,8 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
     of = f", {short(MORE_DATA)}"
     ppo = ppo_settings(config.adapt, rows[0].scenario, 0)
     ppo_told = ", ".join(f"`{name}` {value}" for name, value in to_dict(ppo).items() if name != "steps")
-    further = (
-        f"`+ … PPO`: so many steps more by PPO, {ppo_told}. " if any(ppo_suffix(row.agent) for row in rows) else ""
+    ppo_note = (
+        f"`+ … PPO`: so many steps more by PPO, {ppo_told}. " if any(name_parts(row.agent)[1] for row in rows) else ""
     )
     more = (
         f"After the name of an offline method, `{of[2:]}` says that it learned from {MORE_DATA} transitions of the "
@@ -461,7 +461,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         if any(of[2:] in row.agent for row in rows)
         else ""
     )
-    alike = (
+    mirror_note = (
         f"`{MIRRORED[2:]}`: the Q-values averaged with those of the mirrored road, without further training. "
         if any(row.agent.endswith(MIRRORED) for row in rows)
         else ""
@@ -473,7 +473,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        f"{differing(config.recipe)}{mlps}{more}{further}{alike}"
+        f"{differing(config.recipe)}{mlps}{more}{ppo_note}{mirror_note}"
         f"Last checkpoint, {spawns} test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and "
         "spawns).",
         "",
@@ -501,12 +501,13 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
                 (name, name.replace("RAPID", "online DDQN")),
                 (name, name.replace("RAPID", "online Munchausen DQN")),
             ]
-            if name.removesuffix(ppo_suffix(name)).endswith(f"from {short(MORE_DATA)}"):
+            origin, further, mirrored = name_parts(name)
+            if origin.endswith(f"from {short(MORE_DATA)}"):
                 pairs.append((name, more_distilled()))
-            if ppo_suffix(name):
-                pairs.append((name, name.removesuffix(ppo_suffix(name))))
-            if name.endswith(MIRRORED):
-                pairs.append((name, name.removesuffix(MIRRORED)))
+            if further:
+                pairs.append((name, origin + mirrored))
+            if mirrored:
+                pairs.append((name, origin + further))
         # An ablation is called after what it ablates.
         pairs += [(whole, name) for whole in clean for name in clean if is_ablation(name, whole)]
         for name, other in pairs:

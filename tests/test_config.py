@@ -127,6 +127,10 @@ def test_impossible_numbers_are_refused(overrides: dict[str, Any], setting: str)
     assert setting in str(error.value)
 
 
+def test_an_agent_may_be_mirrored_without_training_it():
+    validate(apply_overrides(preset(), {"adapt": {"steps": 0, "mirror": True}}))
+
+
 def test_integers_widen_to_floats_and_lists_to_tuples():
     config = apply_overrides(preset(), {"mix": {"p": 1}, "network": {"hidden": [8, 8]}})
     assert isinstance(config.mix.p, float)

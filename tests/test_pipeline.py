@@ -16,9 +16,12 @@ import torch
 import rapid
 from rapid import pipeline
 from rapid.config import Config, PpoConfig, preset
+from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
+from rapid.evaluation.rollouts import run_episodes
 from rapid.settings import apply_overrides
+from rapid.training.diagnostics import FORGETTING_STATES
 from rapid.training.record import load_metrics
 
 SMALL = {
@@ -176,6 +179,7 @@ def test_two_agents_of_one_name_stay_apart(config: Config, finished: Path, tmp_p
     ("overrides", "says"),
     [
         ({"network": {"kind": "attentive"}}, "has no adapter"),
+        ({"adapt": {"mirror": True, "scenario": "lane-4-density-2.5"}}, "mirrors the road does so on 3 lanes"),
         ({"mix": {"size": 400}}, "collect.teacher_transitions"),
         ({"mix": {"p": 0.0}, "collect": {"teacher_transitions": 0}}, "collect.teacher_transitions"),
         ({"evaluate": {"attacks": ["pdg"]}}, "did you mean 'pgd'"),
@@ -229,6 +233,28 @@ def test_from_phase_3_on_left_and_right_may_be_made_alike(config: Config, finish
     assert all(value.equal(before[name]) for name, value in found[True, 0].items())
     # It is learned with, too.
     assert any(not value.equal(found[False, 40][name]) for name, value in found[True, 40].items())
+    for other, name in ((2, "lane-2-density-1"), (4, "lane-4-density-1")):
+        with pytest.raises(RapidError, match=f"mirror image on 3 lanes .* but {name} has {other}"):
+            run_episodes(rapid.load_agent(tmp_path / "True-0" / "agent"), name, [900_000])
+        adapt = replace(config.adapt, mirror=True, scenario=name)
+        with pytest.raises(RapidError, match="mirror image on 3 lanes"):
+            pipeline.adapt_agent(replace(config, adapt=adapt), start, None, tmp_path / name)
+    adapt = replace(config.adapt, mirror=True, steps=0, ppo=PpoConfig())
+    with pytest.raises(RapidError, match="would replace the agent itself"):
+        pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "True-40/agent", None, tmp_path / "True-40")
+
+
+def test_what_was_distilled_is_what_forgetting_is_told_of(config: Config, finished: Path, tmp_path: Path):
+    adapt = replace(config.adapt, mirror=True)
+    agent = finished / "distill/rapid/agent"
+    pipeline.adapt_agent(replace(config, adapt=adapt), agent, finished / "mix", tmp_path)
+    network = rapid.load_agent(tmp_path / "agent").network
+    states = torch.from_numpy(load_dataset(finished / "mix").transitions.obs_NVF)
+    distilled = rapid.load_agent(agent).network
+    with torch.inference_mode():
+        same = (network(states).argmax(1) == distilled(states).argmax(1)).double().mean().item()
+    assert len(states) <= FORGETTING_STATES
+    assert load_metrics(tmp_path / "ppo")[-1]["agreement"] == pytest.approx(same)
 
 
 def test_adapting_needs_no_dataset(config: Config, finished: Path, tmp_path: Path):

@@ -136,8 +136,8 @@ def test_every_agent_goes_on_by_ppo_from_where_it_is(benchmark, config, tmp_path
     assert (
         benchmark.ppo_settings(config.adapt, f"{scenario}:progress", 9).crash_penalty > config.adapt.ppo.crash_penalty
     )
-    assert benchmark.ppo_suffix(names[2]) == " + 700K PPO"
-    assert benchmark.ppo_suffix("RAPID, 300K") == ""
+    assert benchmark.name_parts(names[2]) == ("RAPID, 100K, from 60K", " + 700K PPO", "")
+    assert benchmark.name_parts("RAPID, 300K, mirrored") == ("RAPID, 300K", "", ", mirrored")
 
 
 def test_the_mirror_is_put_before_what_is_there(benchmark, config, tmp_path, asked):
@@ -151,7 +151,8 @@ def test_the_mirror_is_put_before_what_is_there(benchmark, config, tmp_path, ask
         assert (settings.steps, settings.ppo.steps, settings.mirror, data) == (0, 0, True, None)
         assert start == tmp_path / scenario / benchmark.file_name(name.removesuffix(", mirrored")) / "agent"
     assert asked[names[0]][0].train == "all"
-    assert not benchmark.is_ablation(names[1], whole)
+    assert not benchmark.is_ablation("RAPID, 300K, mirrored", "RAPID, 300K")
+    assert benchmark.is_ablation("RAPID, 300K, from scratch, mirrored", "RAPID, 300K, mirrored")
     assert benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO, mirrored", f"{whole}, mirrored")
 
 

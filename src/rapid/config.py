@@ -155,7 +155,7 @@ class NetworkConfig:
     """Whether rows with presence 0 are hidden from attention, so that their contents never matter."""
     mirror: bool = False
     """Average the Q-values with those of the mirrored road, left and right swapped back, which takes twice the time.
-    For the reward `progress`: the paper's pays more on the right."""
+    For the reward `progress`, on as many lanes as it was trained on: the paper's reward pays more on the right."""
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ class AdaptConfig:
     freeze_decoder: bool = False
     """Also freeze the action decoder."""
     mirror: bool = False
-    """Set `network.mirror` from this phase on."""
+    """Set `network.mirror` from this phase on; without this an agent keeps what it has."""
     evaluate_every: int = 1_000
     """Environment steps between two evaluations; 0 is never."""
     loss: LossConfig = field(default_factory=lambda: LossConfig(conservative_weight=0.2, robust_weight=0.0, n_step=3))

@@ -68,6 +68,11 @@ class OnnxAgent:
             self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
         )
 
+    @property
+    def mirrored_lanes(self) -> int | None:
+        """On roads with how many lanes left is as good as right to it; None where it tells them apart."""
+        return self.metadata.get("mirrored_lanes")
+
     def act(self, obs_BVF: np.ndarray) -> np.ndarray:
         """Return the greedy actions (B,), int64.
 
@@ -121,7 +126,13 @@ def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray
     if not len(obs_BVF):
         raise RapidError("There are no observations to compare the exported model on. Give a dataset with transitions.")
     network = agent.network
-    description = {"name": agent.name, "lanes": network.lanes, "features": FEATURES, "actions": ACTIONS}
+    description = {
+        "name": agent.name,
+        "lanes": network.lanes,
+        "features": FEATURES,
+        "actions": ACTIONS,
+        "mirrored_lanes": agent.mirrored_lanes,
+    }
     model = build_model(network)
     onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(description)})
     with files.atomic_path(path) as temporary:

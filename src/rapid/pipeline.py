@@ -23,7 +23,7 @@ from rapid.data.shipped import SHIPPED, shipped_sets
 from rapid.data.transitions import Transitions
 from rapid.engines import check_engine
 from rapid.errors import RapidError, did_you_mean
-from rapid.evaluation.agents import PLANNERS, open_agent
+from rapid.evaluation.agents import PLANNERS, check_road, open_agent
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
@@ -166,6 +166,12 @@ def _check_whole(config: Config) -> None:
         raise RapidError(
             f"adapt.train is 'adapter', but a network of kind '{network.kind}' with {network.num_policies} policies "
             "has no adapter. Choose network.kind 'rapid' with network.num-policies 2, or adapt.train 'all'."
+        )
+    own, target = (get_scenario(name).lanes for name in (config.scenario, config.adapt.scenario or config.scenario))
+    if (network.mirror or config.adapt.mirror) and own != target:
+        raise RapidError(
+            f"A network that mirrors the road does so on {own} lanes, those of scenario '{config.scenario}', but "
+            f"adapt.scenario '{config.adapt.scenario}' has {target}. Choose one of {own} lanes, or do without mirror."
         )
     if config.data:
         _given_data(config)
@@ -433,8 +439,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     scenario = config.adapt.scenario or distilled.metadata.get("scenario", config.scenario)
     settings = config.adapt if data else replace(config.adapt, offline_share=0.0)
     network, seed = distilled.network, stream_seed(config.seed, "adapt")
-    if settings.mirror:
-        network.config = replace(network.config, mirror=True)
+    if agent.resolve() == (out / "agent").resolve():
+        raise RapidError(f"Adapting '{agent}' into '{out}' would replace the agent itself. Choose another directory.")
     offline = _learnable(load_dataset(data)) if data else None
     evaluate = _curve(config, scenario, name)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
@@ -442,6 +448,9 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     total = settings.steps + settings.ppo.steps // rollout * rollout
     with tracker, task(f"adapt, {name}", total, "steps") as work:
         forgetting = Forgetting(network, offline, seed)
+        if settings.mirror:
+            network.config = replace(network.config, mirror=True)
+        check_road(distilled, scenario)
         if settings.steps:
             adapt(
                 network,

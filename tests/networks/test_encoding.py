@@ -52,13 +52,14 @@ def test_near_features_by_hand():
     assert features[0, 2].tolist() == [0] * 8
 
 
-def test_the_mirror_by_hand(roads):
+def test_the_mirror_by_hand():
     obs = torch.zeros(1, 15, 5)
-    obs[0, 0] = torch.tensor([1, 300, 4, 20, 1])
+    # With a clock the ego's presence is more than 1.
+    obs[0, 0] = torch.tensor([1.5, 300, 4, 20, 1])
     obs[0, 1] = torch.tensor([1, 350, 12, 15, 0])
     encoding = Encoding("near", lanes=4, mask_absent=True)
     mirrored = encoding.mirrored(obs)
-    assert mirrored[0, 0].tolist() == [1, 300, 8, 20, -1]
+    assert mirrored[0, 0].tolist() == [1.5, 300, 8, 20, -1]
     assert mirrored[0, 1].tolist() == [1, 350, 0, 15, 0]
     assert torch.equal(mirrored[0, 2:], obs[0, 2:])
     assert torch.equal(encoding.mirrored(mirrored), obs)

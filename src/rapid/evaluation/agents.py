@@ -67,6 +67,20 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
     )
 
 
+def check_road(agent: Any, scenario: str) -> None:
+    """Check that what an agent takes for the mirror image of the road is that.
+
+    Raises:
+        RapidError: it was made alike to left and right on a road with another number of lanes.
+    """
+    lanes, own = get_scenario(scenario).lanes, getattr(agent, "mirrored_lanes", None)
+    if own is not None and own != lanes:
+        raise RapidError(
+            f"'{getattr(agent, 'name', 'The agent')}' averages what it sees with its mirror image on {own} lanes "
+            f"(network.mirror), but {scenario} has {lanes}. Drive it on {own} lanes, or train it without."
+        )
+
+
 def kind_of(agent: Any) -> Kind:
     """Return what kind of agent this is: its own `kind` if it has one, else by what it offers."""
     from rapid.teacher.scripted import SCRIPTED

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import rapid
 from rapid.errors import RapidError
-from rapid.evaluation.agents import driver_for, kind_of
+from rapid.evaluation.agents import check_road, driver_for, kind_of
 from rapid.evaluation.metrics import EpisodeRow, Kind
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.worlds import AttackLike, Perturbation, Worlds
@@ -114,11 +114,13 @@ def run_episodes(
     episodes beside it; only a gradient attack with a random start draws for all worlds of a step together.
 
     Raises:
-        RapidError: no seeds, or an attack that cannot be made on the agent; see :func:`is_applicable`.
+        RapidError: no seeds, an attack that cannot be made on the agent (see :func:`is_applicable`), or a road that the
+            agent cannot mirror.
     """
     if len(seeds) == 0:
         raise RapidError("There are no spawn seeds to drive. Ask for at least one episode.")
     lanes = get_scenario(scenario).lanes
+    check_road(agent, scenario)
     attack_name, resolved = _resolve(attack, lanes)
     network = _network(agent)
     if not is_applicable(agent, resolved):

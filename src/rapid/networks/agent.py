@@ -55,6 +55,11 @@ class QAgent:
             raise RapidError("A stack is several agents. Take one of those that `unstack_networks` returns.")
         self.network, self.name, self.metadata = network, name, metadata or {}
 
+    @property
+    def mirrored_lanes(self) -> int | None:
+        """On roads with how many lanes left is as good as right to it; None where it tells them apart."""
+        return self.network.lanes if self.network.config.mirror else None
+
     def act(self, obs_BVF: np.ndarray) -> np.ndarray:
         """Return the greedy actions (B,), int64.
 

@@ -96,7 +96,10 @@ class Encoding(nn.Module):
         return torch.where(present_BV1, features_BVF, 0.0), mask_BV[:, None, None, :]
 
     def mirrored(self, obs_BVF: Tensor) -> Tensor:
-        """Return the observations as they would be were left right: y from the other side, and vy turned round."""
+        """Return the observations as they would be were left right: y from the other side, and vy turned round.
+
+        Rows of absent vehicles stay as they are.
+        """
         return torch.where(obs_BVF[..., :1] > self.absent_V1, self.far_side_F + self.turned_F * obs_BVF, obs_BVF)
 
     def _features(self, obs_BVF: Tensor) -> Tensor:
