@@ -18,7 +18,6 @@ from rapid.networks.q_network import QNetwork, set_phase
 from rapid.networks.stack import unstack_networks
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, torch_stream
-from rapid.settings import to_dict
 from rapid.training.adam import flush_denormals
 from rapid.training.learner import Learner
 from rapid.training.record import Evaluate, Record, Track, crossed, fingerprint, network_fingerprint
@@ -68,8 +67,8 @@ def distill(
         directory,
         {
             "phase": "distill",
-            "config": to_dict(config),
-            "network": to_dict(network.config),
+            "config": config,
+            "network": network.config,
             "weights": network_fingerprint(network),
             "data": data_fingerprint(transitions),
             "teacher_share": teacher_share,

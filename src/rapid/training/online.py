@@ -4,11 +4,12 @@ Paper: sections 3.3 and 4.4.
 """
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from rapid.config import AdaptConfig
+from rapid.config import AdaptConfig, PpoConfig
 from rapid.data.replay import OfflineSampler, ReplayBuffer, join_batches
 from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
@@ -16,7 +17,6 @@ from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
-from rapid.settings import to_dict
 from rapid.training.adam import flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import Learner
@@ -71,8 +71,8 @@ def adapt(
         {
             "phase": "adapt",
             # What comes after does not matter here: it may be added once this is done.
-            "config": {name: value for name, value in to_dict(config).items() if name != "ppo"},
-            "network": to_dict(network.config),
+            "config": replace(config, ppo=PpoConfig()),
+            "network": network.config,
             "weights": network_fingerprint(network),
             "data": data_fingerprint(offline) if offline is not None else None,
             "scenario": scenario,

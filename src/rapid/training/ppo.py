@@ -23,7 +23,7 @@ from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import Scenario, get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
-from rapid.settings import least_steps, to_dict
+from rapid.settings import least_steps
 from rapid.training.adam import Adam, clip_norm, flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import check_generator
@@ -101,8 +101,8 @@ def adapt_by_ppo(
         directory,
         {
             "phase": "ppo",
-            "config": to_dict(config),
-            "network": to_dict(network.config),
+            "config": config,
+            "network": network.config,
             "weights": network_fingerprint(network),
             "scenario": scenario,
             "seed": seed,

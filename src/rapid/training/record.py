@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from rapid import checkpoint
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork
+from rapid.settings import apply_overrides, to_dict
 
 METRICS_FILE, CHECKPOINT_FILE = "metrics.jsonl", "checkpoint.safetensors"
 
@@ -30,7 +32,8 @@ class Record:
 
     Args:
         directory: made if need be.
-        settings: what makes this training this one; a checkpoint of another is refused.
+        settings: what makes this training this one, as JSON values and dataclasses of settings; a checkpoint of another
+            is refused. A setting that its checkpoint was written without had the effect that its default has now.
         every_seconds: time between two checkpoints. When they are taken has no influence on the result.
         track: is given every row, and again the earlier ones when the training goes on.
     """
@@ -47,8 +50,8 @@ class Record:
             self.directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RapidError(f"Cannot train in '{directory}': {error}. Choose a directory you can write to.") from error
-        # As JSON gives it back, so that the comparison sees no tuples.
-        self._settings: dict[str, Any] = json.loads(json.dumps(settings))
+        self._kinds = {key: type(value) for key, value in settings.items() if is_dataclass(value)}
+        self._settings = {key: _plain(value) for key, value in settings.items()}
         self._every, self._track = every_seconds, track
         self._seconds_before = 0.0
         self._start = self._last = time.monotonic()
@@ -69,7 +72,10 @@ class Record:
             metrics.unlink(missing_ok=True)
             return None
         state = checkpoint.load_state(path)
-        differing = [key for key in self._settings if state["settings"].get(key) != self._settings[key]]
+        before = state["settings"]
+        for key in self._kinds.keys() & before.keys():
+            before[key] = _plain(apply_overrides(self._kinds[key](), before[key], key, f"'{path}'"))
+        differing = [key for key in self._settings if before.get(key) != self._settings[key]]
         if differing:
             raise RapidError(
                 f"'{self.directory}' holds a training with other settings ({', '.join(differing)} differ). Choose "
@@ -106,6 +112,11 @@ class Record:
         content = {"settings": self._settings, "seconds": self.seconds, "metrics_bytes": size, "state": state()}
         checkpoint.save_state(self.directory / CHECKPOINT_FILE, content)
         self._last = time.monotonic()
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON gives it back, so that a comparison sees no tuples."""
+    return json.loads(json.dumps(to_dict(value) if is_dataclass(value) else value))
 
 
 def _finite(value: Any) -> Any:
