@@ -239,6 +239,10 @@ def test_from_phase_3_on_left_and_right_may_be_made_alike(config: Config, finish
         adapt = replace(config.adapt, mirror=True, scenario=name)
         with pytest.raises(RapidError, match="mirror image on 3 lanes"):
             pipeline.adapt_agent(replace(config, adapt=adapt), start, None, tmp_path / name)
+    elsewhere = replace(config, scenario="lane-4-density-1")
+    with pytest.raises(RapidError, match="mirror image on 3 lanes"):
+        pipeline.compare(elsewhere, ["slower", str(tmp_path / "True-0" / "agent")], tmp_path / "comparison")
+    assert not (tmp_path / "comparison").exists()
     adapt = replace(config.adapt, mirror=True, steps=0, ppo=PpoConfig())
     with pytest.raises(RapidError, match="would replace the agent itself"):
         pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "True-40/agent", None, tmp_path / "True-40")

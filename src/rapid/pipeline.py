@@ -548,7 +548,9 @@ def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]
 def _open(config: Config, spec: str, scenario: str) -> Any:
     if spec == TEACHER:
         return make_teacher(config.teacher, get_scenario(scenario).lanes, config.seed)
-    return open_agent(spec, scenario, config.seed, config.device)
+    agent = open_agent(spec, scenario, config.seed, config.device)
+    check_road(agent, scenario)
+    return agent
 
 
 def _measure(
