@@ -26,7 +26,7 @@ MIRRORED_ACTIONS = [LANE_RIGHT, IDLE, LANE_LEFT, FASTER, SLOWER]
 class Explanation(NamedTuple):
     """Why a network prefers an action; tensors without gradient, None where the network has no such part.
 
-    Where the network averages with the mirror image, Q-values do, and the rest is of the road as it is.
+    Of a network that averages with the mirror image, the Q-values are means; all else is of the road as it is.
     """
 
     q_BA: Tensor
