@@ -204,8 +204,7 @@ def with_mirror(found: dict[str, Adaptation]) -> dict[str, Adaptation]:
     """Return these agents with their Q-values averaged with those of the mirrored road, untrained further, by name."""
     alike: dict[str, Adaptation] = {}
     for name, (settings, _, _) in found.items():
-        train = "all" if settings.train == "scratch" else settings.train
-        untrained = replace(settings, steps=0, ppo=replace(settings.ppo, steps=0), train=train, mirror=True)
+        untrained = replace(settings, steps=0, ppo=replace(settings.ppo, steps=0), mirror=True)
         alike[f"{name}{MIRRORED}"] = Adaptation(untrained, name)
     return alike
 

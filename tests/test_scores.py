@@ -150,7 +150,6 @@ def test_the_mirror_is_put_before_what_is_there(benchmark, config, tmp_path, ask
         settings, start, data = asked[name]
         assert (settings.steps, settings.ppo.steps, settings.mirror, data) == (0, 0, True, None)
         assert start == tmp_path / scenario / benchmark.file_name(name.removesuffix(", mirrored")) / "agent"
-    assert asked[names[0]][0].train == "all"
     assert not benchmark.is_ablation("RAPID, 300K, mirrored", "RAPID, 300K")
     assert benchmark.is_ablation("RAPID, 300K, from scratch, mirrored", "RAPID, 300K, mirrored")
     assert benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO, mirrored", f"{whole}, mirrored")

@@ -442,15 +442,16 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     if agent.resolve() == (out / "agent").resolve():
         raise RapidError(f"Adapting '{agent}' into '{out}' would replace the agent itself. Choose another directory.")
     offline = _learnable(load_dataset(data)) if data else None
+    # Of what was distilled, before it is mirrored.
+    forgetting = Forgetting(network, offline, seed)
+    if settings.mirror:
+        network.config = replace(network.config, mirror=True)
+    check_road(distilled, scenario)
     evaluate = _curve(config, scenario, name)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
     rollout = settings.ppo.num_envs * settings.ppo.rollout
     total = settings.steps + settings.ppo.steps // rollout * rollout
     with tracker, task(f"adapt, {name}", total, "steps") as work:
-        forgetting = Forgetting(network, offline, seed)
-        if settings.mirror:
-            network.config = replace(network.config, mirror=True)
-        check_road(distilled, scenario)
         if settings.steps:
             adapt(
                 network,
