@@ -80,6 +80,18 @@ def test_a_recorded_update_is_the_update(case, transitions):
     assert moved
 
 
+@pytest.mark.parametrize(("case", "runs"), [("strong", False), ("adapt", True)])
+def test_a_recording_runs_the_adapter_only_where_its_gate_is_open(case, runs, transitions):
+    learner = learner_on("cuda", *CASES[case])
+    adapter = learner.network.head.mixture.policies[1]
+    recorded = []
+    adapter.register_forward_hook(lambda *_: recorded.append(torch.cuda.is_current_stream_capturing()))
+    sampler, rng = OfflineSampler(transitions, 0.9, 1, "cuda"), np.random.default_rng(0)
+    for _ in range(UPDATES):
+        learner.update(sampler.sample(32, rng))
+    assert any(recorded) == runs
+
+
 @pytest.mark.parametrize("case", ["paper", "mlp"])
 def test_it_learns_what_the_cpu_learns(case, transitions):
     config, loss, optimizer, phase = CASES[case]

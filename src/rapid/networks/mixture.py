@@ -59,6 +59,8 @@ class MixtureOfPolicies(nn.Module):
         self.policies = nn.ModuleList(PolicyEncoder(config) for _ in range(num_policies))
         self.gate_NV = nn.Parameter(torch.zeros(num_policies - 1, NUM_VEHICLES))
         self.router = _router(num_inputs(config.input), config.width, num_policies) if num_policies > 1 else None
+        self.stays_closed = False
+        """Whether the gate is 0 and is not trained. A recording on a GPU, which cannot look, goes by it."""
 
     def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
         """Return the mixed tokens (B, V, D)."""
@@ -94,9 +96,11 @@ class MixtureOfPolicies(nn.Module):
 
     def _runs(self, index: int, router_BVN: Tensor) -> bool:
         """Whether the policy can change the output or a gradient; if not, leaving it out changes no bit."""
-        if index == 0 or (router_BVN.is_cuda and torch.cuda.is_current_stream_capturing()):
-            # A recording cannot ask for values, and is replayed with others.
+        if index == 0:
             return True
+        if router_BVN.is_cuda and torch.cuda.is_current_stream_capturing():
+            # A recording cannot ask for values, and is replayed with others.
+            return not self.stays_closed
         if self.top_k < len(self.policies) and not bool(router_BVN[..., index].any()):
             return False
         gate_learns = self.gate_NV.requires_grad and torch.is_grad_enabled()

@@ -221,6 +221,8 @@ def set_phase(network: QNetwork, phase: Phase, freeze_decoder: bool = False) -> 
             gate.requires_grad_(False)
     elif phase == "adapt":
         first.requires_grad_(False)
+    if isinstance(head, TokenHead):
+        head.mixture.stays_closed = phase == "distill" and not bool(head.mixture.gate_NV.any())
     if freeze_decoder:
         if not isinstance(head, TokenHead):
             raise RapidError(f"A '{network.config.kind}' network has no decoder to freeze. Unset freeze_decoder.")

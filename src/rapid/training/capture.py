@@ -1,8 +1,9 @@
 """A gradient step recorded once as a CUDA graph and then replayed.
 
 RAPID's networks are so small that a GPU spends an update waiting for Python to launch the next of some thousand
-kernels. A recorded update is launched as one. It computes the same, and a little in vain: a recording cannot look
-whether an adapter's gate is open, so it runs every adapter, also those that an unrecorded step leaves out.
+kernels. A recorded update is launched as one. It computes the same, while adapting a little in vain: a recording cannot
+look whether a gate is open, so where gates are trained it runs every adapter, also those that an unrecorded step leaves
+out.
 """
 
 from collections.abc import Callable
