@@ -4,14 +4,14 @@ For every scenario and seed: phase 2 on the mixture of the scenario's own data (
 behaviour cloning), then phase 3 there for each number of steps (RAPID's adapter; a double-DQN MLP from scratch that
 explores as RAPID does and, from 50,000 steps on, one with RAPID's loss as well; in the recipe `paper` also a DQN as
 printed), then all of them over the test spawns, clean and attacked. With `--data SCENARIO` all are trained offline on
-the data of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted
-call goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there:
-`scores.parquet` (raw rows) and `scores.md`; `scores-paper` for the recipe `paper`, with the paper's numbers beside
-ours, `scores-progress` for the reward `progress`, `scores-2000` over so many spawns. Of the floors and the planner it
-shows the rows in `floors.parquet`, where they drove the same spawns. With `--ppo STEPS` every agent trained online goes
-on by PPO, as another agent, and with `--mirror` it is also driven as the mean of itself and its mirror image. With
-`--more-data` the default teacher, which needs its model, collects four times what is shipped, and RAPID and CQL learn
-from that for four times as long.
+the data of that one scenario, and adapt to the others. Everything finished is kept under `--work`: an interrupted call
+goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw
+rows) and `scores.md`; `scores-paper` for the recipe `paper`, with the paper's numbers beside ours, `scores-progress`
+for the reward `progress`, `scores-2000` over so many spawns. Of the floors and the planners it shows the rows in
+`floors.parquet`, where they drove the same spawns; over others `--floors` drives them. With `--ppo STEPS` every agent
+trained online goes on by PPO, as another agent, and with `--mirror` it is also driven as the mean of itself and its
+mirror image. With `--more-data` the default teacher, which needs its model, collects four times what is shipped, and
+RAPID and CQL learn from that for four times as long.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
@@ -49,6 +49,7 @@ from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import make_teacher
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
+TEACHER = "teacher"
 FLOORS = ("slower", "rule", "planner-observation", "planner-cars", "planner")
 SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
@@ -411,17 +412,27 @@ def measure(
         save_rows(path, rows)
 
 
-def measure_teacher(work: Path, scenarios: Iterable[str], spawns: int) -> None:
-    """Drive the default teacher; it needs its model."""
-    for scenario in scenarios:
-        path = work / "rows" / f"{scenario}-{spawns}-teacher.parquet"
-        if not path.exists():
-            teacher = make_teacher(TeacherConfig(), get_scenario(scenario).lanes, 0)
-            with task(f"evaluate, {teacher.name}, {scenario}", spawns, "episodes") as shown:
+def measure_references(work: Path, names: Iterable[str], scenarios: Sequence[str], spawns: int) -> None:
+    """Drive what learns nothing here: floors and planners by their names, and the default teacher, as `TEACHER`."""
+    for name in names:
+        for scenario in scenarios:
+            path = reference_rows(work, scenario, spawns, name)
+            if path.exists():
+                continue
+            if name == TEACHER:
+                driver = make_teacher(TeacherConfig(), get_scenario(scenario).lanes, 0)
+            else:
+                driver = open_agent(name, scenario)
+            with task(f"evaluate, {driver.name}, {scenario}", spawns, "episodes") as shown:
                 rows = evaluate_agent(
-                    teacher, scenario, spawn_seeds("test", spawns), ("none",), commit=commit(), progress=shown.advance
+                    driver, scenario, spawn_seeds("test", spawns), ("none",), commit=commit(), progress=shown.advance
                 )
             save_rows(path, rows)
+
+
+def reference_rows(work: Path, scenario: str, spawns: int, name: str) -> Path:
+    """Return where the rows of a floor, a planner or the teacher are kept."""
+    return work / "rows" / f"{scenario}-{spawns}-{name}.parquet"
 
 
 def difference(ours: list[EpisodeRow], theirs: list[EpisodeRow], name: str = "episode_return") -> Estimate:
@@ -547,11 +558,13 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     floors = [row for row in load_rows(out / "floors.parquet") if row.agent in FLOORS and row.seed in seeds]
     # On more spawns than they drove they would be compared with others' driving elsewhere.
     floors = floors if {row.seed for row in floors} == seeds else []
+    references = [TEACHER] if floors else [*FLOORS, TEACHER]
     rows: list[EpisodeRow] = []
     own: list[EpisodeRow] = []
     for scenario in scenarios:
         pattern = f"{data or scenario}/seed-*/rows/{scenario}-{spawns}-*.parquet"
-        paths = [work / "rows" / f"{scenario}-{spawns}-teacher.parquet", *sorted(work.glob(pattern))]
+        references_here = [reference_rows(work, scenario, spawns, name) for name in references]
+        paths = [*references_here, *sorted(work.glob(pattern))]
         here = [row for path in paths if path.exists() for row in load_rows(path)]
         own += here
         rows += [row for row in floors if row.scenario == scenario] + here
@@ -609,6 +622,14 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("runs/scores"), help="where finished parts are kept")
     parser.add_argument("--out", type=Path, default=Path("results"), help="where the table goes")
     parser.add_argument("--teacher", action="store_true", help="drive the default teacher as well; it needs its model")
+    parser.add_argument(
+        "--floors",
+        nargs="+",
+        default=[],
+        choices=FLOORS,
+        metavar="NAME",
+        help=f"drive these as well, for spawns other than those of floors.parquet: {', '.join(FLOORS)}",
+    )
     parser.add_argument("--table", action="store_true", help="only write the table of what is there")
     chosen = parser.parse_args()
     config = preset(chosen.recipe, "full")
@@ -620,8 +641,8 @@ def main() -> None:
             pipeline.check(
                 replace(config, adapt=replace(config.adapt, ppo=replace(config.adapt.ppo, steps=chosen.ppo)))
             )
-        if chosen.teacher:
-            measure_teacher(work, chosen.scenarios, chosen.spawns)
+        references = [*chosen.floors, *([TEACHER] if chosen.teacher else [])]
+        measure_references(work, references, chosen.scenarios, chosen.spawns)
         for seed in chosen.seeds:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
