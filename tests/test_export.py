@@ -67,6 +67,8 @@ def test_an_exported_agent_drives_the_same(roads, tmp_path):
         {"kind": "rapid", "num_policies": 4, "top_k": 1},
         {"kind": "rapid", "num_policies": 1, "top_k": 1},
         {"kind": "rapid", "mirror": True},
+        {"kind": "rapid", "vehicles": 31},
+        {"kind": "mlp", "vehicles": 20, "mirror": True},
         {"kind": "mlp", "input": "raw", "mask_absent": False, "mirror": True},
     ],
     ids=str,
@@ -76,7 +78,8 @@ def test_every_kind_of_network_exports(roads, tmp_path, settings, gate):
     agent = make(**settings) if gate == "closed" else opened(make(**settings))
     if agent.network.config.kind == "mlp-mixture" and gate == "open":
         torch.nn.init.normal_(agent.network.head.weights_N)
-    obs = roads(9, absent=0.4).numpy()
+    obs = np.concatenate([roads(9, absent=0.4).numpy(), roads(9, seed=1).numpy(), roads(9, seed=2).numpy()], 1)
+    obs = obs[:, : agent.vehicles]
     obs[0, 0, 0] = 0  # The ego counts whatever its presence says.
     expected = agent.q_values(obs)
     assert export_onnx(agent, tmp_path / "x.onnx", obs).difference < 1e-5 * max(1, np.abs(expected).max())
@@ -144,7 +147,10 @@ def test_models_made_elsewhere_drive_too_if_their_shapes_fit(roads, tmp_path):
     save_model(tmp_path / "few.onnx", 75, 3)
     with pytest.raises(RapidError, match="returns shape"):
         OnnxAgent(tmp_path / "few.onnx")
-    save_model(tmp_path / "narrow.onnx", 25, 5)
+    assert agent.vehicles == 15
+    save_model(tmp_path / "near.onnx", 25, 5)
+    assert OnnxAgent(tmp_path / "near.onnx").vehicles == 5
+    save_model(tmp_path / "narrow.onnx", 24, 5)
     with pytest.raises(RapidError, match="reads"):
         OnnxAgent(tmp_path / "narrow.onnx")
 

@@ -1,5 +1,6 @@
 """The whole job, as small as it gets: what a user sees of it, killed and resumed, and redone from a step."""
 
+import json
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -180,6 +182,8 @@ def test_two_agents_of_one_name_stay_apart(config: Config, finished: Path, tmp_p
     [
         ({"network": {"kind": "attentive"}}, "has no adapter"),
         ({"adapt": {"mirror": True, "scenario": "lane-4-density-2.5"}}, "mirrors the road does so on 3 lanes"),
+        ({"adapt": {"vehicles": 31}, "network": {"position": "learned"}}, "weights for each of its 15 vehicles"),
+        ({"adapt": {"vehicles": 10}}, "reads 15 vehicles"),
         ({"mix": {"size": 400}}, "collect.teacher_transitions"),
         ({"mix": {"p": 0.0}, "collect": {"teacher_transitions": 0}}, "collect.teacher_transitions"),
         ({"evaluate": {"attacks": ["pdg"]}}, "did you mean 'pgd'"),
@@ -246,6 +250,29 @@ def test_from_phase_3_on_left_and_right_may_be_made_alike(config: Config, finish
     adapt = replace(config.adapt, mirror=True, steps=0, ppo=PpoConfig())
     with pytest.raises(RapidError, match="would replace the agent itself"):
         pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "True-40/agent", None, tmp_path / "True-40")
+
+
+def test_from_phase_3_on_more_may_be_seen(config: Config, finished: Path, tmp_path: Path):
+    start = finished / "distill/rapid/agent"
+    adapt = replace(config.adapt, vehicles=31)
+    pipeline.adapt_agent(replace(config, adapt=adapt), start, finished / "mix", tmp_path / "far")
+    agent = rapid.load_agent(tmp_path / "far/agent")
+    assert agent.vehicles == agent.network.config.vehicles == 31
+    assert json.loads((tmp_path / "far/agent/config.json").read_text())["vehicles"] == 31
+    # It is given what it reads, and what only its farther rows hold moves it.
+    (row,) = run_episodes(agent, config.scenario, [900_000], record=True).recordings
+    assert row.obs_TVF.shape[1:] == (31, 5)
+    assert row.obs_TVF[0, 15:, 0].any()
+    near = np.where(np.arange(31)[:, None] < 15, row.obs_TVF, 0)
+    assert (agent.q_values(row.obs_TVF) != agent.q_values(near)).any()
+    # Once it sees so far it goes on so, by itself or told the same; it cannot go back.
+    for vehicles, out in ((0, "kept"), (31, "told")):
+        adapt = replace(config.adapt, vehicles=vehicles, ppo=PpoConfig())
+        pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "far/agent", None, tmp_path / out)
+        assert rapid.load_agent(tmp_path / out / "agent").vehicles == 31
+    adapt = replace(config.adapt, vehicles=20)
+    with pytest.raises(RapidError, match="reads 31 vehicles"):
+        pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "far/agent", None, tmp_path / "back")
 
 
 def test_what_was_distilled_is_what_forgetting_is_told_of(config: Config, finished: Path, tmp_path: Path):

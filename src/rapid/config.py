@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from rapid.errors import RapidError, did_you_mean
+from rapid.scenarios import NUM_VEHICLES
 
 Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full", "long"]
@@ -153,6 +154,9 @@ class NetworkConfig:
     """Zero gate: w1 = omega1, wi = g*omegai; or wi = tanh(g)*omegai, w1 = 1 - sum wi."""
     mask_absent: bool = True
     """Whether rows with presence 0 are hidden from attention, so that their contents never matter."""
+    vehicles: int = NUM_VEHICLES
+    """V: rows that it reads, the ego's and those of the nearest others. Observations with fewer are as if the rest of
+    the road were empty."""
     mirror: bool = False
     """Average the Q-values with those of the mirrored road, left and right swapped back, which takes twice the time.
     For the reward `progress`, on as many lanes as it was trained on: the paper's reward pays more on the right."""
@@ -314,6 +318,8 @@ class AdaptConfig:
     """`adapter` is the method: policy 1 frozen. `all` fine-tunes every weight. `scratch` starts from new weights."""
     freeze_decoder: bool = False
     """Also freeze the action decoder."""
+    vehicles: int = 0
+    """Set `network.vehicles` from this phase on, whatever the data has, to see farther; 0 leaves it as it is."""
     mirror: bool = False
     """Set `network.mirror` from this phase on; without this an agent keeps what it has."""
     evaluate_every: int = 1_000

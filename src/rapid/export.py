@@ -16,7 +16,7 @@ from rapid import files
 from rapid.errors import RapidError
 from rapid.graph import build_model
 from rapid.networks.agent import QAgent, check_observations
-from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
+from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
 
 METADATA_KEY = "rapid"
 TOLERANCE = 1e-4
@@ -51,12 +51,15 @@ class OnnxAgent:
         inputs, outputs = self.session.get_inputs(), self.session.get_outputs()
         self.input, self.output = inputs[0].name, outputs[0].name
         shape = list(inputs[0].shape)
-        flat = NUM_VEHICLES * NUM_FEATURES
-        if len(inputs) != 1 or shape[1:] not in ([NUM_VEHICLES, NUM_FEATURES], [flat]):
+        sizes = range(1, MAX_VEHICLES + 1)
+        found = [size for size in sizes if shape[1:] in ([size, NUM_FEATURES], [size * NUM_FEATURES])]
+        if len(inputs) != 1 or not found:
             raise RapidError(
                 f"The ONNX model '{path}' reads {[(item.name, item.shape) for item in inputs]}, but an agent reads one "
-                f"input of shape (batch, {NUM_VEHICLES}, {NUM_FEATURES}) or (batch, {flat}). Export it with that input."
+                f"input of shape (batch, {NUM_VEHICLES}, {NUM_FEATURES}) or (batch, {NUM_VEHICLES * NUM_FEATURES}), or "
+                f"of another number of vehicles up to {MAX_VEHICLES}. Export it with that input."
             )
+        self.vehicles = found[0]
         if len(outputs[0].shape) != 2 or outputs[0].shape[1] != len(ACTIONS):
             raise RapidError(
                 f"The ONNX model '{path}' returns shape {outputs[0].shape}, but an agent returns Q-values (batch, "
@@ -87,7 +90,7 @@ class OnnxAgent:
         Raises:
             RapidError: the observations have the wrong shape or are not finite.
         """
-        obs_BVF = check_observations(obs_BVF, self.name)
+        obs_BVF = check_observations(obs_BVF, self.name, self.vehicles)
         values = obs_BVF.reshape(len(obs_BVF), -1) if self.flat else obs_BVF
         return np.asarray(self.session.run([self.output], {self.input: values})[0])
 
@@ -122,7 +125,7 @@ def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray
         import onnx
     except ImportError as error:
         raise RapidError("Exporting needs onnx. Install it: pip install 'rapid-driving[export]'") from error
-    obs_BVF = check_observations(obs_BVF, agent.name)
+    obs_BVF = check_observations(obs_BVF, agent.name, agent.vehicles)
     if not len(obs_BVF):
         raise RapidError("There are no observations to compare the exported model on. Give a dataset with transitions.")
     network = agent.network
@@ -161,7 +164,7 @@ def driven_observations(agent: QAgent, scenario: str, seeds: Sequence[int]) -> n
     """Return every observation (B, V, F) that the agent meets in one episode of each spawn seed."""
     from rapid.simulator import make_vec
 
-    worlds: Any = make_vec(scenario, len(seeds), autoreset=False)
+    worlds: Any = make_vec(scenario, len(seeds), autoreset=False, config=seeing(agent.vehicles))
     obs_WVF, _ = worlds.reset(seed=list(seeds))
     met, running_W = [np.array(obs_WVF)], np.ones(len(seeds), np.bool_)
     while running_W.any():
@@ -175,7 +178,7 @@ def driven_observations(agent: QAgent, scenario: str, seeds: Sequence[int]) -> n
 def latency(path: str | os.PathLike[str], obs_VF: np.ndarray, calls: int = 2_000) -> float:
     """Return the median seconds of one decision at batch 1 on one thread, the array in and the action out."""
     agent = OnnxAgent(path)
-    session, obs_BVF = agent.session, check_observations(obs_VF[None], agent.name)
+    session, obs_BVF = agent.session, check_observations(obs_VF[None], agent.name, agent.vehicles)
     inputs = {agent.input: obs_BVF.reshape(1, -1) if agent.flat else obs_BVF}
     warm_up, seconds = 100, list[float]()
     for _ in range(warm_up + calls):

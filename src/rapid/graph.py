@@ -19,17 +19,18 @@ from rapid.networks.encoding import BESIDE, NEAR, NEAR_FEATURES
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.mlp import MlpHead
 from rapid.networks.q_network import MIRRORED_ACTIONS, ActionDecoder, QNetwork, TokenHead
-from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
+from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES
 
 OPSET, IR_VERSION = 17, 8
 Array = NDArray[np.float32]
 
 
 class Graph:
-    """Nodes and constants, in the order in which they were asked for."""
+    """Nodes and constants, in the order in which they were asked for, of a network that reads so many vehicles."""
 
-    def __init__(self, onnx: Any) -> None:
+    def __init__(self, onnx: Any, vehicles: int) -> None:
         self._onnx, self.nodes, self.constants = onnx, list[Any](), list[Any]()
+        self.vehicles = vehicles
 
     def constant(self, value: Any, kind: type = np.float32) -> str:
         """Keep an array and return its name."""
@@ -72,7 +73,7 @@ def build_model(network: QNetwork) -> Any:
     """
     import onnx
 
-    graph = Graph(onnx)
+    graph = Graph(onnx, network.config.vehicles)
     _q_values(graph, network)
     # The Q-values are what the last node gives.
     graph.nodes[-1].output[0] = "q"
@@ -81,7 +82,7 @@ def build_model(network: QNetwork) -> Any:
         onnx.helper.make_graph(
             graph.nodes,
             "rapid",
-            [make("obs", kind, ["batch", NUM_VEHICLES, NUM_FEATURES])],
+            [make("obs", kind, ["batch", graph.vehicles, NUM_FEATURES])],
             [make("q", kind, ["batch", NUM_ACTIONS])],
             graph.constants,
         ),
@@ -130,7 +131,7 @@ def _seen(graph: Graph, network: QNetwork, obs: str) -> str:
             features = graph.node("Where", present, features, 0.0)
         return _mlps(graph, head, features, read_GF)
     # What the rows of absent vehicles hold has no influence: the mask hides them, and none of them is read.
-    mask = graph.reshape(graph.node("Where", present, 0.0, -np.inf), -1, 1, 1, NUM_VEHICLES) if present else None
+    mask = graph.reshape(graph.node("Where", present, 0.0, -np.inf), -1, 1, 1, graph.vehicles) if present else None
     return _decoder(graph, head.decoder, _mixture(graph, head.mixture, features, read_GF, mask), mask)
 
 
@@ -152,14 +153,14 @@ def _read_near(read_FF: Array) -> Array:
 
 
 def _mlps(graph: Graph, head: MlpHead, features: str, read_GF: Array) -> str:
-    flat, total = graph.reshape(features, -1, NUM_VEHICLES * len(read_GF)), ""
+    flat, total = graph.reshape(features, -1, graph.vehicles * len(read_GF)), ""
     weights_N = [1.0] if head.weights_N is None else _array(head.weights_N).tolist()
     for mlp, weight in zip(head.mlps, weights_N, strict=True):
         layers = [layer for layer in cast(nn.Sequential, mlp) if isinstance(layer, nn.Linear)]
         rows = flat
         for index, layer in enumerate(layers):
             last, matrix = index == len(layers) - 1, _array(layer.weight).T
-            matrix = np.kron(np.eye(NUM_VEHICLES, dtype=np.float32), read_GF) @ matrix if index == 0 else matrix
+            matrix = np.kron(np.eye(graph.vehicles, dtype=np.float32), read_GF) @ matrix if index == 0 else matrix
             share = np.float32(weight if last else 1.0)
             rows = graph.node("Gemm", rows, matrix * share, _array(layer.bias) * share)
             rows = rows if last else graph.node("Relu", rows)
@@ -181,7 +182,7 @@ def _mixture(graph: Graph, mixture: MixtureOfPolicies, features: str, read_GF: A
     if mixture.top_k < len(mixture.policies):
         logits = _top_k(graph, logits, len(mixture.policies), mixture.top_k)
     weights = graph.node("Softmax", logits, axis=-1)
-    gate_VN = np.concatenate([np.ones((NUM_VEHICLES, 1)), _array(mixture.gate_NV).T], 1).astype(np.float32)
+    gate_VN = np.concatenate([np.ones((graph.vehicles, 1)), _array(mixture.gate_NV).T], 1).astype(np.float32)
     if mixture.gate_kind == "tanh":
         gate_VN[:, 0], gate_VN[:, 1:] = 0, np.tanh(gate_VN[:, 1:])
     opened = [index for index in range(1, len(mixture.policies)) if gate_VN[:, index].any()]
@@ -217,19 +218,19 @@ def _top_k(graph: Graph, logits: str, policies: int, kept: int) -> str:
 def _policy(graph: Graph, policy: PolicyEncoder, features: str, read_GF: Array, mask: str | None) -> str:
     """Return the policy's tokens (B, V, D)."""
     width = policy.projection.out_features
-    bias_VD = np.tile(_array(policy.projection.bias), (NUM_VEHICLES, 1))
+    bias_VD = np.tile(_array(policy.projection.bias), (graph.vehicles, 1))
     if policy.position is not None:
         position = _array(cast(Tensor, policy.position))
         bias_VD[: len(position)] += position
     tokens = graph.node("MatMul", features, read_GF @ _array(policy.projection.weight).T)
     rows = graph.reshape(graph.node("Add", tokens, bias_VD), -1, width)
-    rows = _transformer(graph, policy.transformer, rows, NUM_VEHICLES, mask)
-    return graph.reshape(rows, -1, NUM_VEHICLES, width)
+    rows = _transformer(graph, policy.transformer, rows, graph.vehicles, mask)
+    return graph.reshape(rows, -1, graph.vehicles, width)
 
 
 def _decoder(graph: Graph, decoder: ActionDecoder, tokens: str, mask: str | None) -> str:
     """Return the Q-values (B, A)."""
-    length, width, first_D = NUM_VEHICLES, decoder.head.in_features, None
+    length, width, first_D = graph.vehicles, decoder.head.in_features, None
     if decoder.action_token is not None:
         length, first_D = length + 1, _array(decoder.action_token)[0, 0]
         pads = graph.constant([0, 1, 0, 0, 0, 0], np.int64)

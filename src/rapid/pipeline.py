@@ -30,13 +30,13 @@ from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
 from rapid.files import read_json, sha256, write_json, write_text
 from rapid.networks.agent import QAgent, load_agent, save_agent
-from rapid.networks.q_network import QNetwork, build_network
+from rapid.networks.q_network import QNetwork, build_network, check_widening, widened
 from rapid.networks.stack import stack_networks, unstack_networks
 from rapid.progress import format_seconds, task
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.reproduce import paper_numbers
 from rapid.runs import RunDirectory, commit
-from rapid.scenarios import get_scenario
+from rapid.scenarios import get_scenario, seeing
 from rapid.seeding import stream_seed
 from rapid.settings import apply_overrides, to_dict, validate
 from rapid.simulator import make_vec
@@ -167,6 +167,8 @@ def _check_whole(config: Config) -> None:
             f"adapt.train is 'adapter', but a network of kind '{network.kind}' with {network.num_policies} policies "
             "has no adapter. Choose network.kind 'rapid' with network.num-policies 2, or adapt.train 'all'."
         )
+    if config.adapt.vehicles:
+        check_widening(network, config.adapt.vehicles)
     own, target = (get_scenario(name).lanes for name in (config.scenario, config.adapt.scenario or config.scenario))
     if (network.mirror or config.adapt.mirror) and own != target:
         raise RapidError(
@@ -442,12 +444,14 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     if agent.resolve() == (out / "agent").resolve():
         raise RapidError(f"Adapting '{agent}' into '{out}' would replace the agent itself. Choose another directory.")
     offline = _learnable(load_dataset(data)) if data else None
-    # Of what was distilled, before it is mirrored.
+    # Of what was distilled, before it is mirrored or sees farther.
     forgetting = Forgetting(network, offline, seed)
+    if settings.vehicles:
+        network = widened(network, settings.vehicles)
     if settings.mirror:
         network.config = replace(network.config, mirror=True)
-    check_road(distilled, scenario)
-    evaluate = _curve(config, scenario, name)
+    check_road(QAgent(network, distilled.name), scenario)
+    evaluate, seen = _curve(config, scenario, name), seeing(network.config.vehicles)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
     rollout = settings.ppo.num_envs * settings.ppo.rollout
     total = settings.steps + settings.ppo.steps // rollout * rollout
@@ -462,7 +466,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 offline=offline,
                 evaluate=evaluate,
                 progress=work,
-                make_worlds=lambda count: make_vec(scenario, count, simulator=config.simulator),
+                make_worlds=lambda count: make_vec(scenario, count, config.simulator, config=seen),
                 track=tracker.log,
             )
         if settings.ppo.steps:
@@ -476,7 +480,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 forgetting=forgetting,
                 evaluate=evaluate,
                 progress=work,
-                make_worlds=lambda count: make_vec(timed, count, simulator=config.simulator),
+                make_worlds=lambda count: make_vec(timed, count, config.simulator, config=seen),
                 track=tracker.log,
             )
     metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}

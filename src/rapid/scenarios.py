@@ -21,6 +21,9 @@ LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(5)
 FEATURES = ("presence", "x", "y", "vx", "vy")
 """The columns of an observation row; a row is a vehicle, the first row is the ego."""
 NUM_VEHICLES = 15
+"""Rows of an observation, unless an agent wants more."""
+MAX_VEHICLES = 51
+"""Vehicles on the road: the ego and 50 others."""
 NUM_FEATURES = len(FEATURES)
 NUM_ACTIONS = len(ACTIONS)
 
@@ -86,6 +89,11 @@ class Scenario:
                 "normalize_reward": False,
             }
         return config
+
+
+def seeing(vehicles: int) -> dict[str, Any]:
+    """Return what to override of a scenario's configuration so that an observation has so many rows."""
+    return {"observation": {"vehicles_count": vehicles}}
 
 
 SCENARIOS: tuple[str, ...] = tuple(

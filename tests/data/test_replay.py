@@ -53,6 +53,16 @@ def test_offline_batches_hold_the_dataset():
     np.testing.assert_allclose(batch.bootstrap_B, np.where(rows.terminated_N[index], 0, GAMMA), rtol=1e-6)
 
 
+def test_rows_that_the_data_lacks_are_absent():
+    rows = fake_transitions()
+    plain, wide = (OfflineSampler(rows, GAMMA, vehicles=vehicles).store for vehicles in (15, 20))
+    for name in ("obs_BVF", "next_obs_BVF"):
+        had, has = getattr(plain, name), getattr(wide, name)
+        assert torch.equal(has[:, :15], had)
+        assert not has[:, 15:].any()
+        assert has.shape[1] == 20
+
+
 def test_a_share_of_every_batch_comes_from_the_teacher():
     rows = concatenate([fake_transitions(), fake_transitions(20, RANDOM, seed=1)])
     sampler = OfflineSampler(rows, GAMMA, teacher_share=0.25)

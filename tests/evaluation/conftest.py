@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from toy_worlds import ToyWorlds
@@ -10,8 +12,9 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> list[ToyWorlds]:
     """Put toy worlds in the place of `rapid.make_vec`; the list holds those that were made."""
     made: list[ToyWorlds] = []
 
-    def make(scenario: str, num_envs: int, simulator: str, autoreset: bool) -> ToyWorlds:
+    def make(scenario: str, num_envs: int, simulator: str, config: dict[str, Any], autoreset: bool) -> ToyWorlds:
         assert not autoreset
+        assert config == {"observation": {"vehicles_count": 15}}
         made.append(ToyWorlds(num_envs))
         return made[-1]
 

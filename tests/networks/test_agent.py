@@ -41,8 +41,9 @@ def test_an_agent_acts_greedily_without_gradient(roads):
 
 
 @pytest.mark.parametrize("kind", ["rapid", "attentive", "mlp", "mlp-mixture"])
-def test_saved_and_loaded_agents_are_bit_equal(roads, tmp_path, kind):
-    network = make(kind=kind)
+@pytest.mark.parametrize("vehicles", [15, 20])
+def test_saved_and_loaded_agents_are_bit_equal(roads, tmp_path, kind, vehicles):
+    network = make(kind=kind, vehicles=vehicles)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.normal_()
@@ -53,7 +54,9 @@ def test_saved_and_loaded_agents_are_bit_equal(roads, tmp_path, kind):
     assert agent.network.config == network.config
     assert agent.network.lanes == 4
     assert not agent.network.training
-    assert (agent.q_values(roads(9).numpy()) == QAgent(network).q_values(roads(9).numpy())).all()
+    assert agent.vehicles == vehicles
+    obs = np.concatenate([roads(9).numpy(), roads(9, seed=1).numpy()], 1)[:, :vehicles]
+    assert (agent.q_values(obs) == QAgent(network).q_values(obs)).all()
     for key, value in network.state_dict().items():
         assert torch.equal(value, agent.network.state_dict()[key])
 
@@ -90,7 +93,7 @@ def test_missing_agents(tmp_path, saved):
     [
         ({"format": "other"}, "does not describe an agent"),
         ({"version": 99}, "version 99"),
-        ({"vehicles": 5}, "vehicles 5"),
+        ({"vehicles": 5}, "5 vehicles"),
         ({"features": ["x"]}, "features"),
         ({"actions": ["LEFT"]}, "actions"),
         ({"lanes": "three"}, "damaged"),

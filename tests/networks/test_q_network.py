@@ -1,12 +1,14 @@
 """Q-networks of every kind: symmetries, determinism, phases, explanations."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.mlp import MlpHead
-from rapid.networks.q_network import TokenHead, build_network, set_phase
+from rapid.networks.q_network import TokenHead, build_network, set_phase, widened
 
 SMALL = {"width": 16, "heads": 2, "feedforward": 32, "hidden": (24, 24)}
 KINDS = ("rapid", "attentive", "mlp", "mlp-mixture")
@@ -99,6 +101,47 @@ def test_absent_rows_never_matter_when_masked(roads, kind, reading):
     assert gradient[~absent].any()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("position", ["ego", "none", "sinusoidal"])
+def test_rows_that_are_not_there_are_absent(roads, kind, position):
+    network, obs = make(kind=kind, position=position, vehicles=31), roads(4)
+    padded = torch.nn.functional.pad(obs, (0, 0, 0, 16))
+    assert torch.equal(network(obs), network(padded))
+    assert torch.equal(network.explain(obs).q_without_BVA, network.explain(padded).q_without_BVA)
+    assert network.explain(obs).q_without_BVA.shape == (4, 31, 5)
+
+
+@pytest.mark.parametrize("position", ["ego", "none", "sinusoidal"])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_widened_network_is_the_same_until_there_is_more_to_see(roads, position, mirror):
+    network = make(position=position, num_policies=3, mirror=mirror)
+    with torch.no_grad():
+        network.head.mixture.gate_NV.normal_(generator=torch.Generator().manual_seed(0))
+    wide, obs = widened(network, 31), roads(6, absent=0.3)
+    assert wide.config == replace(network.config, vehicles=31)
+    assert torch.allclose(wide(obs), network(obs), rtol=1e-5, atol=1e-6)
+    gate_NV = network.head.mixture.gate_NV
+    assert torch.equal(wide.head.mixture.gate_NV[:, :15], gate_NV)
+    assert torch.equal(wide.head.mixture.gate_NV[:, 15:], gate_NV[:, -1:].expand(-1, 16))
+    more = torch.cat([obs, roads(6, seed=1)], 1)
+    assert not torch.allclose(wide(more), wide(obs), atol=1e-4)
+    assert widened(network, 15) is network
+
+
+@pytest.mark.parametrize(
+    ("settings", "vehicles", "says"),
+    [
+        ({"kind": "mlp"}, 31, "weights for each of its 15 vehicles"),
+        ({"position": "learned"}, 31, "weights for each of its 15 vehicles"),
+        ({}, 14, "reads 15 vehicles"),
+        ({}, 52, "between 1 and 51"),
+    ],
+)
+def test_what_cannot_be_widened_says_why(settings, vehicles, says):
+    with pytest.raises(RapidError, match=says):
+        widened(make(**settings), vehicles)
+
+
 def test_the_ego_is_distinguished_by_default(roads):
     network, obs = make(), roads(4, absent=0)
     swapped = obs[:, [1, 0, *range(2, 15)]]
@@ -173,7 +216,17 @@ def test_phases_of_the_baselines():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"num_policies": 0}, {"top_k": 3}, {"top_k": 0}, {"heads": 3}, {"layers": 0}, {"decoder_layers": 0}]
+    "bad",
+    [
+        {"num_policies": 0},
+        {"top_k": 3},
+        {"top_k": 0},
+        {"heads": 3},
+        {"layers": 0},
+        {"decoder_layers": 0},
+        {"vehicles": 0},
+        {"vehicles": 52},
+    ],
 )
 def test_impossible_networks_are_refused(bad):
     with pytest.raises(RapidError):

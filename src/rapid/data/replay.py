@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rapid.data.batch import TransitionBatch
-from rapid.data.transitions import TEACHER, Transitions
+from rapid.data.transitions import TEACHER, Transitions, with_rows
 from rapid.errors import RapidError
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
 
@@ -54,6 +54,8 @@ def _take(store: TransitionBatch, index_B: Tensor) -> TransitionBatch:
 class OfflineSampler:
     """Uniform batches of a fixed dataset, or batches with a fixed share of teacher transitions.
 
+    Of more `vehicles` than the data has, those that it lacks are absent.
+
     Raises:
         RapidError: there are no transitions, or a share is asked of a source that has none.
     """
@@ -65,6 +67,7 @@ class OfflineSampler:
         steps: int = 1,
         device: str = "cpu",
         teacher_share: float | None = None,
+        vehicles: int = NUM_VEHICLES,
     ) -> None:
         if not len(transitions):
             raise RapidError("The dataset is empty. Collect transitions first.")
@@ -76,10 +79,10 @@ class OfflineSampler:
             return torch.from_numpy(np.ascontiguousarray(array)).to(device)
 
         self.store = TransitionBatch(
-            tensor(transitions.obs_NVF),
+            tensor(with_rows(transitions.obs_NVF, vehicles)),
             tensor(transitions.action_N),
             tensor(reward_N),
-            tensor(transitions.next_obs_NVF[last_N]),
+            tensor(with_rows(transitions.next_obs_NVF[last_N], vehicles)),
             tensor(bootstrap_N),
             tensor(teacher_N),
             None if np.isnan(soft).all() else tensor(soft),
@@ -115,8 +118,16 @@ class OfflineSampler:
 class ReplayBuffer:
     """A ring of the last `capacity` (n-step) transitions of W worlds that are stepped together."""
 
-    def __init__(self, capacity: int, num_envs: int, discount: float, steps: int = 1, device: str = "cpu") -> None:
-        shape = (capacity, NUM_VEHICLES, NUM_FEATURES)
+    def __init__(
+        self,
+        capacity: int,
+        num_envs: int,
+        discount: float,
+        steps: int = 1,
+        device: str = "cpu",
+        vehicles: int = NUM_VEHICLES,
+    ) -> None:
+        shape = (capacity, vehicles, NUM_FEATURES)
         self.capacity, self.device = capacity, device
         self._discount, self._steps = discount, steps
         self._store = TransitionBatch(

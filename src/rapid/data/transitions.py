@@ -29,6 +29,11 @@ _SHAPES: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
 }
 
 
+def with_rows(obs_NVF: NDArray[np.float32], vehicles: int) -> NDArray[np.float32]:
+    """Return observations with at least so many rows; those that are added are absent."""
+    return np.pad(obs_NVF, ((0, 0), (0, max(vehicles - obs_NVF.shape[1], 0)), (0, 0)))
+
+
 @dataclass(frozen=True)
 class Transitions:
     """N transitions as arrays; the steps of an episode need not be complete nor in order (a mixture drops some)."""

@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from rapid.errors import RapidError
 from rapid.files import read_json, write_json
-from rapid.scenarios import NUM_FEATURES, NUM_VEHICLES
+from rapid.scenarios import NUM_FEATURES
 
 _FORMAT = 1
 _GATE = 12.0
@@ -123,7 +123,7 @@ def _from_dict(episode: dict[str, Any]) -> Recording:
         seed=episode["seed"],
         attack=episode["attack"],
         crashed=episode["crashed"],
-        obs_TVF=array(episode["observations"]).reshape(-1, NUM_VEHICLES, NUM_FEATURES),
+        obs_TVF=array(episode["observations"]).reshape(len(episode["observations"]), -1, NUM_FEATURES),
         action_T=np.array(episode["actions"], np.int64),
         reward_T=np.array([math.nan if v is None else v for v in episode["rewards"]], np.float64),
         q_TA=None if episode["q"] is None else array(episode["q"]),

@@ -17,7 +17,7 @@ from rapid.evaluation.agents import check_road, driver_for, kind_of
 from rapid.evaluation.metrics import EpisodeRow, Kind
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.worlds import AttackLike, Perturbation, Worlds
-from rapid.scenarios import get_scenario
+from rapid.scenarios import NUM_VEHICLES, get_scenario, seeing
 from rapid.simulator import Simulator
 
 NO_ATTACK = "none"
@@ -132,7 +132,8 @@ def run_episodes(
     together = PLANNED_WORLDS if kind_of(agent) == "planner" else MAX_WORLDS
     for first in range(0, len(seeds), together):
         worlds = Worlds(np.asarray(seeds[first : first + together], np.int64), record)
-        env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, autoreset=False)
+        seen = seeing(getattr(agent, "vehicles", NUM_VEHICLES))
+        env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, config=seen, autoreset=False)
         try:
             driver = driver_for(agent, env, generator_seed)
             worlds.drive(env, driver, Perturbation(resolved, network, generator_seed, worlds.seed_B), lanes, progress)

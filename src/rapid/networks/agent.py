@@ -56,6 +56,11 @@ class QAgent:
         self.network, self.name, self.metadata = network, name, metadata or {}
 
     @property
+    def vehicles(self) -> int:
+        """V: rows that its observations have."""
+        return self.network.config.vehicles
+
+    @property
     def mirrored_lanes(self) -> int | None:
         """On roads with how many lanes left is as good as right to it; None where it tells them apart."""
         return self.network.lanes if self.network.config.mirror else None
@@ -86,20 +91,21 @@ class QAgent:
         return self.network.explain(self._tensor(obs_BVF))
 
     def _tensor(self, obs_BVF: np.ndarray) -> Tensor:
-        return torch.from_numpy(check_observations(obs_BVF, self.name)).to(self.network.scale_F.device)
+        return torch.from_numpy(check_observations(obs_BVF, self.name, self.vehicles)).to(self.network.scale_F.device)
 
 
-def check_observations(obs_BVF: np.ndarray, name: str) -> np.ndarray:
+def check_observations(obs_BVF: np.ndarray, name: str, vehicles: int) -> np.ndarray:
     """Return the observations as contiguous float32 (B, V, F).
 
     Raises:
         RapidError: they have the wrong shape or are not finite.
     """
     obs_BVF = np.ascontiguousarray(obs_BVF, np.float32)
-    if obs_BVF.ndim != 3 or obs_BVF.shape[1:] != (NUM_VEHICLES, NUM_FEATURES):
+    if obs_BVF.ndim != 3 or obs_BVF.shape[1:] != (vehicles, NUM_FEATURES):
         raise RapidError(
-            f"Agent '{name}' was given observations of shape {obs_BVF.shape}, but reads (batch, {NUM_VEHICLES}, "
-            f"{NUM_FEATURES}): {NUM_VEHICLES} vehicles with {', '.join(FEATURES)}. Use a scenario of rapid.scenarios."
+            f"Agent '{name}' was given observations of shape {obs_BVF.shape}, but reads (batch, {vehicles}, "
+            f"{NUM_FEATURES}): {vehicles} vehicles with {', '.join(FEATURES)}. Use a scenario of rapid.scenarios"
+            f"{f', with config=rapid.scenarios.seeing({vehicles})' if vehicles != NUM_VEHICLES else ''}."
         )
     if not np.isfinite(obs_BVF).all():
         world, vehicle, feature = (int(index) for index in np.argwhere(~np.isfinite(obs_BVF))[0])
@@ -136,7 +142,7 @@ def save_agent(directory: str | os.PathLike[str], network: QNetwork, metadata: d
             "lanes": network.lanes,
             "features": list(FEATURES),
             "ranges": [float(value) for value in network.scale_F],
-            "vehicles": NUM_VEHICLES,
+            "vehicles": network.config.vehicles,
             "actions": list(ACTIONS),
             "weights_sha256": files.sha256(folder / WEIGHTS_FILE),
             "metadata": metadata,
@@ -159,7 +165,7 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
             f"The agent '{folder}' has format version {config.get('version')}, but this program reads version "
             f"{VERSION}. Use the program's version that wrote it, or train it again."
         )
-    spaces = {"features": list(FEATURES), "vehicles": NUM_VEHICLES, "actions": list(ACTIONS)}
+    spaces = {"features": list(FEATURES), "actions": list(ACTIONS)}
     for key, expected in spaces.items():
         if config.get(key) != expected:
             raise RapidError(
@@ -183,6 +189,11 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
             f"has {ranges}. Use the program's version that wrote it, or train it again."
         )
     settings = apply_overrides(NetworkConfig(), config["network"], "network", f"'{folder / CONFIG_FILE}'")
+    if config.get("vehicles") != settings.vehicles:
+        raise RapidError(
+            f"The agent '{folder}' is damaged: {CONFIG_FILE} has {config.get('vehicles')} vehicles, and a network that "
+            f"reads {settings.vehicles}. Save it again."
+        )
     network = build_network(settings, lanes, seed=0)
     _load_weights(network, folder, config.get("weights_sha256"))
     return QAgent(network.to(device).eval(), str(metadata.get("name") or folder.resolve().name), metadata)

@@ -56,6 +56,7 @@ class Encoding(nn.Module):
         lanes: lanes of the road, for the ranges.
         mask_absent: hide rows with presence below one half, apart from the ego's: their features read 0, and
             attention cannot see them.
+        vehicles: V, rows of an observation.
     """
 
     scale_F: Tensor
@@ -69,12 +70,18 @@ class Encoding(nn.Module):
     turned_F: Tensor
     """The sign of a feature in the mirror: y and vy are turned round."""
 
-    def __init__(self, kind: Literal["raw", "normalized", "ego", "near"], lanes: int, mask_absent: bool) -> None:
+    def __init__(
+        self,
+        kind: Literal["raw", "normalized", "ego", "near"],
+        lanes: int,
+        mask_absent: bool,
+        vehicles: int = NUM_VEHICLES,
+    ) -> None:
         super().__init__()
         self.kind, self.mask_absent = kind, mask_absent
         self.register_buffer("scale_F", feature_scale(lanes))
         self.register_buffer("unit_F", torch.tensor(EGO_UNITS))
-        is_ego_V1 = (torch.arange(NUM_VEHICLES) == 0)[:, None]
+        is_ego_V1 = (torch.arange(vehicles) == 0)[:, None]
         # Row 0 is always the ego, whatever its presence says, and there must be something to attend to.
         self.register_buffer("absent_V1", torch.where(is_ego_V1, -torch.inf, 0.5), persistent=False)
         # Which of the ego's features are taken off: from the others all but presence, from itself x alone.

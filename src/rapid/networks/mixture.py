@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from rapid.config import NetworkConfig
 from rapid.networks.blocks import Transformer
 from rapid.networks.encoding import num_inputs
-from rapid.scenarios import NUM_VEHICLES
 
 
 class PolicyEncoder(nn.Module):
@@ -23,11 +22,11 @@ class PolicyEncoder(nn.Module):
         super().__init__()
         self.projection = nn.Linear(num_inputs(config.input), config.width)
         if config.position == "learned":
-            self.position = nn.Parameter(torch.empty(NUM_VEHICLES, config.width))
+            self.position = nn.Parameter(torch.empty(config.vehicles, config.width))
         elif config.position == "ego":
             self.position = nn.Parameter(torch.empty(1, config.width))
         elif config.position == "sinusoidal":
-            self.register_buffer("position", sinusoids(NUM_VEHICLES, config.width), persistent=False)
+            self.register_buffer("position", sinusoids(config.vehicles, config.width), persistent=False)
         else:
             self.position = None
         self.transformer = Transformer(config.layers, config.width, config.heads, config.feedforward)
@@ -38,7 +37,7 @@ class PolicyEncoder(nn.Module):
         if self.position is not None:
             rows = self.position.shape[0]
             # A mark on the ego alone is one row, filled up with zeros.
-            tokens_BVD = tokens_BVD + nn.functional.pad(self.position, (0, 0, 0, NUM_VEHICLES - rows))
+            tokens_BVD = tokens_BVD + nn.functional.pad(self.position, (0, 0, 0, features_BVF.shape[1] - rows))
         return self.transformer(tokens_BVD, mask_B11V)
 
 
@@ -57,7 +56,7 @@ class MixtureOfPolicies(nn.Module):
         super().__init__()
         self.top_k, self.gate_kind = min(config.top_k, num_policies), config.gate
         self.policies = nn.ModuleList(PolicyEncoder(config) for _ in range(num_policies))
-        self.gate_NV = nn.Parameter(torch.zeros(num_policies - 1, NUM_VEHICLES))
+        self.gate_NV = nn.Parameter(torch.zeros(num_policies - 1, config.vehicles))
         self.router = _router(num_inputs(config.input), config.width, num_policies) if num_policies > 1 else None
         self.stays_closed = False
         """Whether the gate is 0 and is not trained. A recording on a GPU, which cannot look, goes by it."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from rapid.config import NetworkConfig
 from rapid.networks.encoding import num_inputs
-from rapid.scenarios import NUM_ACTIONS, NUM_VEHICLES
+from rapid.scenarios import NUM_ACTIONS
 
 
 class MlpHead(nn.Module):
@@ -25,12 +25,14 @@ class MlpHead(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         count = config.num_policies if config.kind == "mlp-mixture" else 1
-        self.mlps = nn.ModuleList(self._mlp(num_inputs(config.input), config.hidden) for _ in range(count))
+        self.mlps = nn.ModuleList(
+            self._mlp(config.vehicles * num_inputs(config.input), config.hidden) for _ in range(count)
+        )
         self.weights_N = nn.Parameter(torch.zeros(count)) if count > 1 else None
 
     @staticmethod
     def _mlp(inputs: int, hidden: tuple[int, ...]) -> nn.Sequential:
-        sizes = (NUM_VEHICLES * inputs, *hidden)
+        sizes = (inputs, *hidden)
         layers: list[nn.Module] = [nn.Flatten()]
         for before, after in zip(sizes, hidden, strict=False):
             layers += [nn.Linear(before, after), nn.ReLU()]
@@ -62,7 +64,7 @@ class MlpStack(nn.Module):
 
     def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
         """Return the Q-values (B, A); the first B/S rows are those of the first member, and so on."""
-        hidden = features_BVF.view(self.members, -1, NUM_VEHICLES * features_BVF.shape[-1])
+        hidden = features_BVF.view(self.members, -1, features_BVF[0].numel())
         last = len(self.weights_SIO) - 1
         for index, (weight_SIO, bias_S1O) in enumerate(zip(self.weights_SIO, self.biases_S1O, strict=True)):
             hidden = torch.baddbmm(bias_S1O, hidden, weight_SIO)

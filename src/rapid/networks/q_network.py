@@ -3,6 +3,7 @@
 Shapes: B batch, V vehicles, F features, D width, N policies, A actions, L layers, H heads.
 """
 
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ from rapid.networks.blocks import Transformer
 from rapid.networks.encoding import Encoding
 from rapid.networks.mixture import MixtureOfPolicies
 from rapid.networks.mlp import MlpHead, MlpStack
-from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, NUM_VEHICLES, SLOWER
+from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, MAX_VEHICLES, NUM_ACTIONS, SLOWER
 from rapid.seeding import torch_stream
 
 Phase = Literal["distill", "adapt", "all"]
@@ -62,7 +63,7 @@ class ActionDecoder(nn.Module):
     def attention(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> Tensor:
         """Return the attention of the token that is read to the vehicles (B, L, H, V)."""
         tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V)
-        return self.transformer.attention(tokens_BTD, mask_B11T)[:, :, :, 0, -NUM_VEHICLES:]
+        return self.transformer.attention(tokens_BTD, mask_B11T)[:, :, :, 0, -tokens_BVD.shape[1] :]
 
     def _with_action_token(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> tuple[Tensor, Tensor | None]:
         if self.action_token is None:
@@ -98,7 +99,7 @@ class QNetwork(nn.Module):
     def __init__(self, config: NetworkConfig, lanes: int) -> None:
         super().__init__()
         self.config, self.lanes = config, lanes
-        self.encoding = Encoding(config.input, lanes, config.mask_absent)
+        self.encoding = Encoding(config.input, lanes, config.mask_absent, config.vehicles)
         self.head: TokenHead | MlpHead | MlpStack
         self.head = TokenHead(config) if config.kind in ("rapid", "attentive") else MlpHead(config)
         # A buffer, for a list of indices would be copied to the device at every call.
@@ -127,6 +128,7 @@ class QNetwork(nn.Module):
 
     def forward(self, obs_BVF: Tensor) -> Tensor:
         """Return the Q-values (B, A)."""
+        obs_BVF = pad_rows(obs_BVF, self.config.vehicles)
         q_BA = self.head(*self.encoding(obs_BVF))
         if not self.config.mirror:
             return q_BA
@@ -136,10 +138,11 @@ class QNetwork(nn.Module):
     @torch.no_grad()
     def explain(self, obs_BVF: Tensor) -> Explanation:
         """Return the Q-values and what they rest on, for each vehicle."""
+        obs_BVF = pad_rows(obs_BVF, self.config.vehicles)
         q_BA = self(obs_BVF)
-        batch = obs_BVF.shape[0]
-        hidden_BVVF = obs_BVF[:, None] * (1 - torch.eye(NUM_VEHICLES, device=obs_BVF.device))[:, :, None]
-        q_without_BVA = self(hidden_BVVF.flatten(0, 1)).view(batch, NUM_VEHICLES, -1)
+        batch, vehicles = obs_BVF.shape[:2]
+        hidden_BVVF = obs_BVF[:, None] * (1 - torch.eye(vehicles, device=obs_BVF.device))[:, :, None]
+        q_without_BVA = self(hidden_BVVF.flatten(0, 1)).view(batch, vehicles, -1)
         q_without_BVA[:, 0] = q_BA
         if not isinstance(self.head, TokenHead):
             return Explanation(q_BA, q_without_BVA, None, None, None, None)
@@ -151,11 +154,17 @@ class QNetwork(nn.Module):
         return Explanation(q_BA, q_without_BVA, weights_BVN, router_BVN, gate_NV, attention_BLHV)
 
 
+def pad_rows(obs_BVF: Tensor, vehicles: int) -> Tensor:
+    """Return observations with at least so many rows; those that are added are absent, as highway-env has them."""
+    missing = vehicles - obs_BVF.shape[1]
+    return nn.functional.pad(obs_BVF, (0, 0, 0, missing)) if missing > 0 else obs_BVF
+
+
 def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
     """Return a new network whose weights depend on `config` and `seed` alone, with every parameter trainable.
 
     Raises:
-        RapidError: N < 1, K outside 1..N, or a width that the heads do not divide.
+        RapidError: N < 1, K outside 1..N, a width that the heads do not divide, or more vehicles than there are.
     """
     if config.num_policies < 1 or not 1 <= config.top_k <= config.num_policies:
         raise RapidError(
@@ -168,11 +177,56 @@ def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
             f"{config.decoder_layers} layers cannot be built: "
             "the width must be a multiple of the heads, with at least one head and one layer."
         )
+    if not 1 <= config.vehicles <= MAX_VEHICLES:
+        raise RapidError(
+            f"A network that reads vehicles V = {config.vehicles} cannot be built: V must be between 1 and "
+            f"{MAX_VEHICLES}, all that are on the road."
+        )
     # The constructors draw from the global stream; every such value is overwritten below, so its state is kept.
     with torch.random.fork_rng(devices=[]):
         network = QNetwork(config, lanes)
     _initialize(network, torch_stream(seed, "network"))
     return network
+
+
+def check_widening(config: NetworkConfig, vehicles: int) -> None:
+    """Check that a network of these settings can be `widened` to so many rows.
+
+    Raises:
+        RapidError: it reads more, or it has weights for every row.
+    """
+    if vehicles < config.vehicles:
+        raise RapidError(
+            f"adapt.vehicles is {vehicles}, but the network reads {config.vehicles} vehicles and has learned a gate "
+            f"for each. Set it to {config.vehicles} to {MAX_VEHICLES}, or to 0 to leave them as they are."
+        )
+    per_row = config.kind not in ("rapid", "attentive") or config.position == "learned"
+    if vehicles > config.vehicles and per_row:
+        raise RapidError(
+            f"adapt.vehicles is {vehicles}, but a network of kind '{config.kind}' and position '{config.position}' has "
+            f"weights for each of its {config.vehicles} vehicles and none for more. Set network.vehicles to {vehicles} "
+            "when it is distilled, or adapt.vehicles to 0."
+        )
+
+
+def widened(network: QNetwork, vehicles: int) -> QNetwork:
+    """Return the network as one that reads so many rows; where there are no more than it had, it is the same.
+
+    The gates of the new rows, which are those farthest away, are that of the last row it had.
+
+    Raises:
+        RapidError: fewer rows than it reads, or a network with weights for every row.
+    """
+    config = network.config
+    check_widening(config, vehicles)
+    if vehicles == config.vehicles:
+        return network
+    wide = build_network(replace(config, vehicles=vehicles), network.lanes, seed=0).to(network.scale_F.device)
+    weights = network.state_dict()
+    gate_NV = weights["head.mixture.gate_NV"]
+    more_NV = gate_NV[:, -1:].expand(-1, vehicles - config.vehicles)
+    wide.load_state_dict(weights | {"head.mixture.gate_NV": torch.cat([gate_NV, more_NV], 1)})
+    return wide.train(network.training)
 
 
 @torch.no_grad()

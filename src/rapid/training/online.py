@@ -15,7 +15,7 @@ from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
-from rapid.scenarios import get_scenario
+from rapid.scenarios import get_scenario, seeing
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.training.adam import flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
@@ -93,11 +93,14 @@ def adapt(
     planned = int(max(total_steps - config.learning_starts, 0) * config.updates_per_step)
     loss = config.loss
     learner = Learner(network, config.optimizer, loss, planned, torch_stream(seed, "adapt/attack", device))
-    buffer = ReplayBuffer(config.buffer_size, worlds_count, loss.discount, loss.n_step, device)
+    vehicles = network.config.vehicles
+    buffer = ReplayBuffer(config.buffer_size, worlds_count, loss.discount, loss.n_step, device, vehicles)
     # Over several steps the offline rewards would be those of other drivers, half of them random.
-    sampler = OfflineSampler(offline, loss.discount, 1, device) if offline and offline_count else None
+    sampler = (
+        OfflineSampler(offline, loss.discount, 1, device, vehicles=vehicles) if offline and offline_count else None
+    )
     rng = numpy_stream(seed, "adapt/exploration and batches")
-    drive = Drive(make_worlds or _default_worlds(scenario), worlds_count, seed)
+    drive = Drive(make_worlds or _default_worlds(scenario, vehicles), worlds_count, seed)
     explorer = Explorer(worlds_count, config.exploration_hold)
     timed = get_scenario(scenario).clock
     steps = 0
@@ -187,7 +190,7 @@ def _check(config: AdaptConfig, offline: Transitions | None) -> int:
     return count
 
 
-def _default_worlds(scenario: str) -> MakeWorlds:
+def _default_worlds(scenario: str, vehicles: int) -> MakeWorlds:
     from rapid.simulator import make_vec
 
-    return lambda count: make_vec(scenario, count)
+    return lambda count: make_vec(scenario, count, config=seeing(vehicles))

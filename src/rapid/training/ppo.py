@@ -21,7 +21,7 @@ from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
-from rapid.scenarios import Scenario, get_scenario
+from rapid.scenarios import Scenario, get_scenario, seeing
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.settings import least_steps
 from rapid.training.adam import Adam, clip_norm, flush_denormals
@@ -112,7 +112,8 @@ def adapt_by_ppo(
     )
     set_phase(network, "adapt" if config.train == "adapter" else "all", config.freeze_decoder)
     learner = PpoLearner(network, ppo, config.optimizer.gate_rate, seen.clock, seed, rollouts)
-    drive = Drive(make_worlds or _default_worlds(replace(seen, clock=True)), ppo.num_envs, stream_seed(seed, "ppo"))
+    make_worlds = make_worlds or _default_worlds(replace(seen, clock=True), network.config.vehicles)
+    drive = Drive(make_worlds, ppo.num_envs, stream_seed(seed, "ppo"))
     sampler = torch_stream(seed, "ppo/actions", device)
     before = -(-config.steps // config.num_envs) * config.num_envs
     done = 0
@@ -345,7 +346,7 @@ def _critic(config: NetworkConfig) -> NetworkConfig:
     return replace(config, kind="mlp" if config.kind.startswith("mlp") else "attentive")
 
 
-def _default_worlds(scenario: Scenario) -> MakeWorlds:
+def _default_worlds(scenario: Scenario, vehicles: int) -> MakeWorlds:
     from rapid.simulator import make_vec
 
-    return lambda count: make_vec(scenario, count)
+    return lambda count: make_vec(scenario, count, config=seeing(vehicles))
