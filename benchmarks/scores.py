@@ -8,16 +8,18 @@ the data of that one scenario, and adapt to the others. Everything finished is k
 goes on where it was, and calls for other seeds can run beside it. `--table` writes what is there: `scores.parquet` (raw
 rows) and `scores.md`; `scores-paper` for the recipe `paper`, with the paper's numbers beside ours, `scores-progress`
 for the reward `progress`, `scores-2000` over so many spawns. Of the floors and the planners it shows the rows in
-`floors.parquet`, where they drove the same spawns; over others `--floors` drives them. With `--ppo STEPS` every agent
-trained online goes on by PPO, as another agent, and with `--mirror` it is also driven as the mean of itself and its
-mirror image. With `--more-data` the default teacher, which needs its model, collects four times what is shipped, and
-RAPID and CQL learn from that for four times as long.
+`floors.parquet`, where they drove the same spawns; over others `--floors` drives them. With `--vehicles N` RAPID is
+also trained to read N vehicles from phase 3 on, with `--ppo STEPS` every agent trained online goes on by PPO, as
+another agent, and with `--mirror` it is also driven as the mean of itself and its mirror image. With `--more-data` the
+default teacher, which needs its model, collects four times what is shipped, and RAPID and CQL learn from that for four
+times as long.
 
     python benchmarks/scores.py --seeds 0 1 2 3 4        # or one process for each seed
     python benchmarks/scores.py --table
 """
 
 import argparse
+import re
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
@@ -58,6 +60,8 @@ MLP_DISCOUNT = 0.93
 PROGRESS_CRASH_PENALTY = 5.0
 """What a crash costs more in PPO under `progress`: where all speed is paid, the usual 2 leave more crashes than
 always-slower has (docs/log.md)."""
+WHOLE = ", fine-tuned whole"
+"""What is put after an agent's name where no part of it was frozen."""
 MIRRORED = ", mirrored"
 """What is put after an agent's name where its Q-values are averaged with those of the mirrored road."""
 RULE_DATA = "distilled, rule data"
@@ -171,9 +175,9 @@ def online_recipes(
         dqn = replace(from_scratch, loss=plain, optimizer=replace(from_scratch.optimizer, learning_rate=rate))
         found[f"online DQN, {short(steps)}"] = Adaptation(dqn, "offline DQN")
     if ablations:
-        for what, weights in (("fine-tuned whole", "all"), ("from scratch", "scratch")):
+        for what, weights in ((WHOLE, "all"), (", from scratch", "scratch")):
             other = replace(adapt, train=weights)
-            found[f"RAPID, {short(steps)}, {what}"] = Adaptation(other, "distilled", "teacher")
+            found[f"RAPID, {short(steps)}{what}"] = Adaptation(other, "distilled", "teacher")
     if more_data:
         # Who begins higher explores no more than the shortest budget does, whatever the steps: else it forgets.
         careful = replace(adaptation(config.recipe, 0), scenario=scenario, steps=steps)
@@ -188,16 +192,31 @@ def ppo_settings(adapt: AdaptConfig, scenario: str, steps: int) -> PpoConfig:
     return replace(ppo, crash_penalty=PROGRESS_CRASH_PENALTY) if progress else ppo
 
 
-def with_ppo(found: dict[str, Adaptation], scenario: str, steps: int) -> dict[str, Adaptation]:
-    """Return how each of these agents goes on by PPO for so many steps, by name."""
+def with_vehicles(found: dict[str, Adaptation], vehicles: int) -> dict[str, Adaptation]:
+    """Return how RAPID is trained to read so many vehicles online, by name."""
+    return {
+        f"{name}, {vehicles} seen": way._replace(settings=replace(way.settings, vehicles=vehicles))
+        for name, way in found.items()
+        if name.startswith("RAPID")
+    }
+
+
+def seen_as_usual(name: str) -> str:
+    """Return an agent's name without how many vehicles it reads."""
+    return re.sub(r", \d+ seen", "", name)
+
+
+def with_ppo(found: dict[str, Adaptation], scenario: str, steps: int, ablations: bool = False) -> dict[str, Adaptation]:
+    """Return how each of these agents goes on by PPO for so many steps, by name; `ablations` freeze nothing."""
     further: dict[str, Adaptation] = {}
     for name, (settings, _, source) in found.items():
         ppo = ppo_settings(settings, scenario, steps)
         # Nothing begins anew here, whatever it once began from.
         train = "all" if settings.train == "scratch" else settings.train
-        further[f"{name} + {short(steps)} PPO"] = Adaptation(
-            replace(settings, steps=0, ppo=ppo, train=train), name, source
-        )
+        on = Adaptation(replace(settings, steps=0, ppo=ppo, train=train), name, source)
+        further[f"{name} + {short(steps)} PPO"] = on
+        if ablations and train == "adapter":
+            further[f"{name} + {short(steps)} PPO{WHOLE}"] = on._replace(settings=replace(on.settings, train="all"))
     return further
 
 
@@ -221,6 +240,7 @@ def train(
     more_data: bool = False,
     ppo: int = 0,
     mirror: bool = False,
+    vehicles: int = 0,
 ) -> list[tuple[str, Path]]:
     """Train what is missing and return the agents to be measured in a scenario, as (name, directory).
 
@@ -235,6 +255,7 @@ def train(
         more_data: whether agents are trained on data that is collected first as well.
         ppo: for how many steps every agent trained online goes on by PPO; 0 for none.
         mirror: whether every agent trained online is made alike to left and right as well.
+        vehicles: how many RAPID also learns to read online; 0 for no more than what was distilled.
 
     Raises:
         RapidError: an agent of `only` does not exist, or one was trained with other settings.
@@ -247,8 +268,10 @@ def train(
     online: dict[str, Adaptation] = {}
     for steps in budgets:
         online |= online_recipes(config, scenario, steps, ablations, more_data)
+    if vehicles:
+        online |= with_vehicles(online, vehicles)
     if ppo:
-        online |= with_ppo(online, scenario, ppo)
+        online |= with_ppo(online, scenario, ppo, ablations)
     if mirror:
         online |= with_mirror(online)
     wanted = list(only) or [*offline, *online]
@@ -257,7 +280,7 @@ def train(
             names = ", ".join(f"'{name}'" for name in (*offline, *online))
             raise RapidError(
                 f"There is no agent '{name}' among {names}. Choose others, or other --steps; some need --ablations, "
-                "--more-data, --ppo or --mirror."
+                "--more-data, --vehicles, --ppo or --mirror."
             )
     needed = set(wanted)
     for name in wanted:
@@ -372,9 +395,11 @@ def is_ablation(name: str, whole: str) -> bool:
 
 
 def name_parts(name: str) -> tuple[str, str, str]:
-    """Return an agent's name as :func:`with_ppo` and :func:`with_mirror` found it, and what each has put after it."""
+    """Return an agent's name without its additions, what :func:`with_vehicles` and :func:`with_ppo` have put after it,
+    and what :func:`with_mirror` has.
+    """
     trained = name.removesuffix(MIRRORED)
-    origin = trained.partition(" + ")[0]
+    origin = seen_as_usual(trained.partition(" + ")[0])
     return origin, trained[len(origin) :], name[len(trained) :]
 
 
@@ -461,7 +486,9 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
     ppo = ppo_settings(config.adapt, rows[0].scenario, 0)
     ppo_told = ", ".join(f"`{name}` {value}" for name, value in to_dict(ppo).items() if name != "steps")
     ppo_note = (
-        f"`+ … PPO`: so many steps more by PPO, {ppo_told}. " if any(name_parts(row.agent)[1] for row in rows) else ""
+        f"`+ … PPO`: so many steps more by PPO, {ppo_told}. "
+        if any(" PPO" in name_parts(row.agent)[1] for row in rows)
+        else ""
     )
     more = (
         f"After the name of an offline method, `{of[2:]}` says that it learned from {MORE_DATA} transitions of the "
@@ -476,6 +503,11 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         if any(row.agent.endswith(MIRRORED) for row in rows)
         else ""
     )
+    seen_note = (
+        "`… seen`: so many vehicles are read from phase 3 on. "
+        if any(seen_as_usual(row.agent) != row.agent for row in rows)
+        else ""
+    )
     commits = ", ".join(dict.fromkeys(row.commit[:7] or "unknown" for row in rows))
     lines = [
         "# Scores",
@@ -483,7 +515,7 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
         f"Recipe `{config.recipe}`; shipped data of {data or 'each scenario itself'}, mixed at p = {config.mix.p:g}, "
         f"{config.mix.size} transitions; {config.distill.iterations} gradient steps offline for every method; an "
         f"online method's name tells its environment steps, {config.adapt.updates_per_step:g} gradient steps for each. "
-        f"{differing(config.recipe)}{mlps}{more}{ppo_note}{mirror_note}"
+        f"{differing(config.recipe)}{mlps}{more}{seen_note}{ppo_note}{mirror_note}"
         f"Last checkpoint, {spawns} test spawns, means with 95 % intervals (hierarchical bootstrap over seeds and "
         "spawns).",
         "",
@@ -514,10 +546,14 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
             origin, further, mirrored = name_parts(name)
             if origin.endswith(f"from {short(MORE_DATA)}"):
                 pairs.append((name, more_distilled()))
+            if seen_as_usual(name) != name:
+                pairs.append((name, seen_as_usual(name)))
             if further:
                 pairs.append((name, origin + mirrored))
             if mirrored:
                 pairs.append((name, origin + further))
+            if further.endswith(WHOLE):
+                pairs.append((origin + further.removesuffix(WHOLE) + mirrored, name))
         # An ablation is called after what it ablates.
         pairs += [(whole, name) for whole in clean for name in clean if is_ablation(name, whole)]
         for name, other in pairs:
@@ -604,6 +640,13 @@ def main() -> None:
         help=f"collect {MORE_DATA} transitions of the teacher, and train RAPID and CQL on them as well",
     )
     parser.add_argument(
+        "--vehicles",
+        type=int,
+        default=0,
+        metavar="N",
+        help="train RAPID to see so many vehicles from phase 3 on, as agents of their own",
+    )
+    parser.add_argument(
         "--ppo",
         type=int,
         default=0,
@@ -637,17 +680,16 @@ def main() -> None:
     work = chosen.work / chosen.recipe
     if not chosen.table:
         pipeline.check(config)
-        if chosen.ppo:
-            pipeline.check(
-                replace(config, adapt=replace(config.adapt, ppo=replace(config.adapt.ppo, steps=chosen.ppo)))
-            )
+        if chosen.ppo or chosen.vehicles:
+            ppo = replace(config.adapt.ppo, steps=chosen.ppo)
+            pipeline.check(replace(config, adapt=replace(config.adapt, ppo=ppo, vehicles=chosen.vehicles)))
         references = [*chosen.floors, *([TEACHER] if chosen.teacher else [])]
         measure_references(work, references, chosen.scenarios, chosen.spawns)
         for seed in chosen.seeds:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario
                 own, home = replace(config, seed=seed, scenario=data), work / data / f"seed-{seed}"
-                options = (chosen.ablations, chosen.only, chosen.more_data, chosen.ppo, chosen.mirror)
+                options = (chosen.ablations, chosen.only, chosen.more_data, chosen.ppo, chosen.mirror, chosen.vehicles)
                 agents = train(own, data, home, scenario, chosen.steps, *options)
                 measure(own, agents, home, scenario, chosen.spawns, chosen.attacks)
     table(work, chosen.scenarios, chosen.data, chosen.spawns, config, chosen.out)

@@ -140,6 +140,16 @@ def test_every_agent_goes_on_by_ppo_from_where_it_is(benchmark, config, tmp_path
     assert benchmark.name_parts("RAPID, 300K, mirrored") == ("RAPID, 300K", "", ", mirrored")
 
 
+def test_ppo_without_a_frozen_part_is_an_ablation(benchmark, config, tmp_path, asked):
+    scenario, usual = "lane-4-density-2.5", "RAPID, 300K + 700K PPO"
+    names = [usual, f"{usual}, fine-tuned whole"]
+    benchmark.train(config, scenario, tmp_path, scenario, (300_000,), only=names, ppo=700_000, ablations=True)
+    frozen, whole = (asked[name] for name in names)
+    assert (frozen[0].train, whole[0]) == ("adapter", replace(frozen[0], train="all"))
+    assert whole[1:] == frozen[1:]
+    assert benchmark.name_parts(names[1]) == ("RAPID, 300K", " + 700K PPO, fine-tuned whole", "")
+
+
 def test_the_mirror_is_put_before_what_is_there(benchmark, config, tmp_path, asked):
     scenario, whole = "lane-3-density-2:progress", "RAPID, 300K + 700K PPO"
     names = ["online DDQN, 100K, mirrored", f"{whole}, mirrored"]
@@ -153,6 +163,25 @@ def test_the_mirror_is_put_before_what_is_there(benchmark, config, tmp_path, ask
     assert not benchmark.is_ablation("RAPID, 300K, mirrored", "RAPID, 300K")
     assert benchmark.is_ablation("RAPID, 300K, from scratch, mirrored", "RAPID, 300K, mirrored")
     assert benchmark.is_ablation("RAPID, 300K, from scratch + 700K PPO, mirrored", f"{whole}, mirrored")
+
+
+def test_who_sees_more_is_told_apart_from_an_ablation(benchmark, config, tmp_path, asked):
+    scenario = "lane-4-density-2.5:progress"
+    names = ["RAPID, 100K, from 60K", "RAPID, 100K, from 60K, 31 seen", "RAPID, 100K, from 60K, 31 seen + 900K PPO"]
+    options = {"only": names, "more_data": True, "ppo": 900_000, "vehicles": 31}
+    benchmark.train(config, scenario, tmp_path, scenario, (100_000,), **options)
+    usual, wide, further = (asked[name] for name in names)
+    assert wide == (replace(usual[0], vehicles=31), *usual[1:])
+    assert (further[0].steps, further[0].ppo.steps, further[0].vehicles) == (0, 900_000, 31)
+    assert benchmark.seen_as_usual(names[2]) == "RAPID, 100K, from 60K + 900K PPO"
+    assert not benchmark.is_ablation(names[1], names[0])
+    assert not benchmark.is_ablation("RAPID, 300K, from scratch, 31 seen", "RAPID, 300K")
+    assert benchmark.is_ablation("RAPID, 300K, from scratch, 31 seen", "RAPID, 300K, 31 seen")
+    assert benchmark.name_parts(names[2]) == (names[0], ", 31 seen + 900K PPO", "")
+    with pytest.raises(RapidError, match="There is no agent 'online DDQN, 100K, 31 seen'"):
+        benchmark.train(
+            config, scenario, tmp_path, scenario, (100_000,), only=["online DDQN, 100K, 31 seen"], vehicles=31
+        )
 
 
 def test_who_begins_from_more_data_is_careful_for_longer(benchmark, config, tmp_path, asked):
