@@ -252,6 +252,12 @@ def test_from_phase_3_on_left_and_right_may_be_made_alike(config: Config, finish
         pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "True-40/agent", None, tmp_path / "True-40")
 
 
+def test_a_run_whose_agent_sees_more_than_the_others_has_its_page(config: Config, tmp_path: Path):
+    pipeline.run(apply_overrides(config, {"adapt": {"vehicles": 31}}), tmp_path / "run", say=lambda line: None)
+    assert rapid.load_agent(tmp_path / "run/adapt/rapid/agent").vehicles == 31
+    assert "after adaptation" in (tmp_path / "run/report.html").read_text()
+
+
 def test_from_phase_3_on_more_may_be_seen(config: Config, finished: Path, tmp_path: Path):
     start = finished / "distill/rapid/agent"
     adapt = replace(config.adapt, vehicles=31)

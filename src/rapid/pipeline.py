@@ -686,8 +686,11 @@ def _routing(config: Config, directory: Path, recordings: Sequence[Recording]) -
         return []
     obs_VF = recording.obs_TVF[len(recording.action_T) // 2]
     snapshots = []
-    for label, agent in (("before adaptation", "distill"), ("after adaptation", "adapt")):
-        weights_BVN = load_agent(directory / agent / "rapid" / "agent").explain(obs_VF[None]).weights_BVN
+    for label, phase in (("before adaptation", "distill"), ("after adaptation", "adapt")):
+        agent = load_agent(directory / phase / "rapid" / "agent")
+        # What was distilled may see fewer: the nearest, which come first.
+        seen_VF = obs_VF[: agent.vehicles]
+        weights_BVN = agent.explain(seen_VF[None]).weights_BVN
         if weights_BVN is not None:
-            snapshots.append(RoutingSnapshot(label, weights_BVN[0].numpy(), obs_VF))
+            snapshots.append(RoutingSnapshot(label, weights_BVN[0].numpy(), seen_VF))
     return snapshots

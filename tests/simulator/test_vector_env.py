@@ -7,7 +7,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from rapid.errors import RapidError
-from rapid.scenarios import SCENARIOS
+from rapid.scenarios import SCENARIOS, seeing
 from rapid.simulator import make_env, make_vec
 from rapid.simulator.vector_env import CompiledVectorEnv
 
@@ -124,6 +124,19 @@ def test_snapshots_and_forecasts_of_any_world() -> None:
         assert (seen[0] == seen[1]).all()
         assert (seen[0] == ahead.observations[0, t]).all()
         assert rewards[0] == ahead.rewards[0, t]
+
+
+def test_more_rows_are_farther_vehicles() -> None:
+    scenario, seeds = "lane-5-density-3", list(range(20))
+    near, far = (make_vec(scenario, 20, autoreset=False, config=seeing(count)) for count in (15, 31))
+    ours, theirs = near.reset(seed=seeds)[0], far.reset(seed=seeds)[0]
+    for _ in range(10):
+        assert np.array_equal(ours, theirs[:, :15])
+        shown = theirs[..., 0] == 1
+        ahead = np.where(shown, np.abs(theirs[..., 1] - theirs[:, :1, 1]), np.inf)
+        assert (ahead[:, 15:].min(1) >= ahead[:, 1:15].max(1)).all()
+        assert shown[:, 15:].any()
+        ours, theirs = (worlds.step(np.ones(20, np.int64))[0] for worlds in (near, far))
 
 
 def test_what_a_step_returned_does_not_change_afterwards() -> None:
