@@ -155,8 +155,8 @@ class NetworkConfig:
     mask_absent: bool = True
     """Whether rows with presence 0 are hidden from attention, so that their contents never matter."""
     vehicles: int = NUM_VEHICLES
-    """V: rows that it reads, the ego's and those of the nearest others. Observations with fewer are as if the rest of
-    the road were empty."""
+    """V: rows that it reads, the ego's and those of the nearest others. Of observations with more it reads the first;
+    those with fewer are as if the rest of the road were empty."""
     mirror: bool = False
     """Average the Q-values with those of the mirrored road, left and right swapped back, which takes twice the time.
     For the reward `progress`, on as many lanes as it was trained on: the paper's reward pays more on the right."""

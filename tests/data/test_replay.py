@@ -53,9 +53,10 @@ def test_offline_batches_hold_the_dataset():
     np.testing.assert_allclose(batch.bootstrap_B, np.where(rows.terminated_N[index], 0, GAMMA), rtol=1e-6)
 
 
-def test_rows_that_the_data_lacks_are_absent():
+def test_rows_that_the_data_lacks_are_absent_and_those_not_wanted_left_out():
     rows = fake_transitions()
-    plain, wide = (OfflineSampler(rows, GAMMA, vehicles=vehicles).store for vehicles in (15, 20))
+    plain, wide, short = (OfflineSampler(rows, GAMMA, vehicles=vehicles).store for vehicles in (15, 20, 8))
+    assert torch.equal(short.obs_BVF, plain.obs_BVF[:, :8])
     for name in ("obs_BVF", "next_obs_BVF"):
         had, has = getattr(plain, name), getattr(wide, name)
         assert torch.equal(has[:, :15], had)

@@ -103,12 +103,14 @@ def test_absent_rows_never_matter_when_masked(roads, kind, reading):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("position", ["ego", "none", "sinusoidal"])
-def test_rows_that_are_not_there_are_absent(roads, kind, position):
+def test_rows_that_are_not_there_are_absent_and_more_are_not_read(roads, kind, position):
     network, obs = make(kind=kind, position=position, vehicles=31), roads(4)
     padded = torch.nn.functional.pad(obs, (0, 0, 0, 16))
     assert torch.equal(network(obs), network(padded))
     assert torch.equal(network.explain(obs).q_without_BVA, network.explain(padded).q_without_BVA)
     assert network.explain(obs).q_without_BVA.shape == (4, 31, 5)
+    short = make(kind=kind, position=position, vehicles=8)
+    assert torch.equal(short(obs), short(obs[:, :8]))
 
 
 @pytest.mark.parametrize("position", ["ego", "none", "sinusoidal"])

@@ -54,7 +54,7 @@ def _take(store: TransitionBatch, index_B: Tensor) -> TransitionBatch:
 class OfflineSampler:
     """Uniform batches of a fixed dataset, or batches with a fixed share of teacher transitions.
 
-    Of more `vehicles` than the data has, those that it lacks are absent.
+    Of `vehicles` other than the data has, those that it lacks are absent, and the farthest left out.
 
     Raises:
         RapidError: there are no transitions, or a share is asked of a source that has none.

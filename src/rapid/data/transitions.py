@@ -30,8 +30,8 @@ _SHAPES: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
 
 
 def with_rows(obs_NVF: NDArray[np.float32], vehicles: int) -> NDArray[np.float32]:
-    """Return observations with at least so many rows; those that are added are absent."""
-    return np.pad(obs_NVF, ((0, 0), (0, max(vehicles - obs_NVF.shape[1], 0)), (0, 0)))
+    """Return observations with so many rows: the nearest vehicles, which come first, and after them absent ones."""
+    return np.pad(obs_NVF[:, :vehicles], ((0, 0), (0, max(vehicles - obs_NVF.shape[1], 0)), (0, 0)))
 
 
 @dataclass(frozen=True)

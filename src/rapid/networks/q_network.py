@@ -128,7 +128,7 @@ class QNetwork(nn.Module):
 
     def forward(self, obs_BVF: Tensor) -> Tensor:
         """Return the Q-values (B, A)."""
-        obs_BVF = pad_rows(obs_BVF, self.config.vehicles)
+        obs_BVF = with_rows(obs_BVF, self.config.vehicles)
         q_BA = self.head(*self.encoding(obs_BVF))
         if not self.config.mirror:
             return q_BA
@@ -138,7 +138,7 @@ class QNetwork(nn.Module):
     @torch.no_grad()
     def explain(self, obs_BVF: Tensor) -> Explanation:
         """Return the Q-values and what they rest on, for each vehicle."""
-        obs_BVF = pad_rows(obs_BVF, self.config.vehicles)
+        obs_BVF = with_rows(obs_BVF, self.config.vehicles)
         q_BA = self(obs_BVF)
         batch, vehicles = obs_BVF.shape[:2]
         hidden_BVVF = obs_BVF[:, None] * (1 - torch.eye(vehicles, device=obs_BVF.device))[:, :, None]
@@ -154,10 +154,11 @@ class QNetwork(nn.Module):
         return Explanation(q_BA, q_without_BVA, weights_BVN, router_BVN, gate_NV, attention_BLHV)
 
 
-def pad_rows(obs_BVF: Tensor, vehicles: int) -> Tensor:
-    """Return observations with at least so many rows; those that are added are absent, as highway-env has them."""
+def with_rows(obs_BVF: Tensor, vehicles: int) -> Tensor:
+    """Return observations with so many rows: the nearest vehicles, which come first, and after them absent ones."""
     missing = vehicles - obs_BVF.shape[1]
-    return nn.functional.pad(obs_BVF, (0, 0, 0, missing)) if missing > 0 else obs_BVF
+    # Padding by less than nothing cuts off.
+    return nn.functional.pad(obs_BVF, (0, 0, 0, missing)) if missing else obs_BVF
 
 
 def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
