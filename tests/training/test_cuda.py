@@ -9,8 +9,9 @@ import torch
 from rapid.config import Config, LossConfig, OptimizerConfig, preset
 from rapid.data.dataset import load_dataset, mix
 from rapid.data.replay import OfflineSampler
+from rapid.data.transitions import with_rows
 from rapid.networks.agent import load_agent, save_agent
-from rapid.networks.q_network import build_network, set_phase
+from rapid.networks.q_network import build_network, set_phase, widened
 from rapid.training import offline
 from rapid.training.capture import WARM_UP
 from rapid.training.learner import Learner
@@ -154,7 +155,7 @@ def test_resumed_equals_uninterrupted(transitions, tmp_path, monkeypatch, stop):
 
 def test_phase_3_trains_there_and_the_agent_drives_on_a_cpu(transitions, tmp_path):
     config = replace(preset("strong", "tiny").adapt, evaluate_every=0)
-    network = build_network(STRONG.network, 3, 0).to("cuda")
+    network = widened(build_network(STRONG.network, 3, 0).to("cuda"), 20)
     adapt(network, config, SCENARIO, tmp_path / "adapt", 0, transitions)
     ppo = replace(config.ppo, steps=200, num_envs=4, rollout=10, batch_size=16, critic_steps=40)
     before = {name: weight.clone() for name, weight in network.state_dict().items()}
@@ -164,5 +165,5 @@ def test_phase_3_trains_there_and_the_agent_drives_on_a_cpu(transitions, tmp_pat
     assert "head.mixture.gate_NV" not in same
     save_agent(tmp_path / "agent", network, {})
     there, here = load_agent(tmp_path / "agent", "cuda"), load_agent(tmp_path / "agent")
-    obs_BVF = transitions.obs_NVF[:20]
+    obs_BVF = with_rows(transitions.obs_NVF[:20], 20)
     np.testing.assert_allclose(there.q_values(obs_BVF), here.q_values(obs_BVF), rtol=1e-3, atol=1e-3)
