@@ -42,6 +42,7 @@ from rapid.evaluation.statistics import Estimate, paired_difference
 from rapid.evaluation.summary import summary_text
 from rapid.files import write_text
 from rapid.networks.agent import load_agent
+from rapid.networks.q_network import check_widening
 from rapid.progress import task
 from rapid.report.data import paper_return
 from rapid.runs import commit
@@ -51,7 +52,6 @@ from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import make_teacher
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
-TEACHER = "teacher"
 FLOORS = ("slower", "rule", "planner-observation", "planner-cars", "planner")
 SETTINGS_FROM = {0: "full", 50_000: "quick", 200_000: "long"}
 """From so many online steps on phase 3 has the settings of this scale, but for the steps."""
@@ -437,14 +437,14 @@ def measure(
         save_rows(path, rows)
 
 
-def measure_references(work: Path, names: Iterable[str], scenarios: Sequence[str], spawns: int) -> None:
-    """Drive what learns nothing here: floors and planners by their names, and the default teacher, as `TEACHER`."""
+def measure_references(work: Path, out: Path, names: Iterable[str], scenarios: Sequence[str], spawns: int) -> None:
+    """Drive what learns nothing here where it has not: floors and planners by their names, and the default teacher."""
     for name in names:
         for scenario in scenarios:
             path = reference_rows(work, scenario, spawns, name)
-            if path.exists():
+            if path.exists() or floor_rows(out, scenario, spawns, name):
                 continue
-            if name == TEACHER:
+            if name == pipeline.TEACHER:
                 driver = make_teacher(TeacherConfig(), get_scenario(scenario).lanes, 0)
             else:
                 driver = open_agent(name, scenario)
@@ -453,6 +453,14 @@ def measure_references(work: Path, names: Iterable[str], scenarios: Sequence[str
                     driver, scenario, spawn_seeds("test", spawns), ("none",), commit=commit(), progress=shown.advance
                 )
             save_rows(path, rows)
+
+
+def floor_rows(out: Path, scenario: str, spawns: int, name: str) -> list[EpisodeRow]:
+    """Return a floor's rows in `floors.parquet`; none if it has not driven all of these spawns there."""
+    rows = [row for row in load_rows(out / "floors.parquet") if (row.agent, row.scenario) == (name, scenario)]
+    driven = {row.seed: row for row in rows}
+    seeds = spawn_seeds("test", spawns)
+    return [driven[seed] for seed in seeds] if set(seeds) <= driven.keys() else []
 
 
 def reference_rows(work: Path, scenario: str, spawns: int, name: str) -> Path:
@@ -540,24 +548,26 @@ def report(rows: list[EpisodeRow], config: Config, data: str, spawns: int, comma
                 (name, teacher),
                 (name, "planner-observation"),
                 (name, "distilled"),
-                (name, name.replace("RAPID", "online DDQN")),
-                (name, name.replace("RAPID", "online Munchausen DQN")),
+                *(
+                    (name, seen_as_usual(name).replace("RAPID", f"online {other}"))
+                    for other in ("DDQN", "Munchausen DQN")
+                ),
             ]
             origin, further, mirrored = name_parts(name)
+            trained = origin + further
             if origin.endswith(f"from {short(MORE_DATA)}"):
                 pairs.append((name, more_distilled()))
-            if seen_as_usual(name) != name:
-                pairs.append((name, seen_as_usual(name)))
             if further:
-                pairs.append((name, origin + mirrored))
+                # Where it began, and as it would have been with as many rows as the data has, or partly frozen.
+                pairs += [(name, trained.partition(" + ")[0] + mirrored), (name, seen_as_usual(name))]
+                if further.endswith(WHOLE):
+                    pairs.append((trained.removesuffix(WHOLE) + mirrored, name))
             if mirrored:
-                pairs.append((name, origin + further))
-            if further.endswith(WHOLE):
-                pairs.append((origin + further.removesuffix(WHOLE) + mirrored, name))
+                pairs.append((name, trained))
         # An ablation is called after what it ablates.
         pairs += [(whole, name) for whole in clean for name in clean if is_ablation(name, whole)]
-        for name, other in pairs:
-            if other in clean and name in clean:
+        for name, other in dict.fromkeys(pairs):
+            if name != other and other in clean and name in clean:
                 gain = difference(clean[name], clean[other])
                 crash = difference(clean[name], clean[other], "crashed")
                 lines.append(f"- {name} against {other}, paired: return {shown(gain)}, crash share {shown(crash, 3)}.")
@@ -590,20 +600,16 @@ def beside_paper(rows: list[EpisodeRow], scenario: str) -> list[str]:
 
 def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Config, out: Path) -> None:
     """Write what has been measured so far."""
-    seeds = set(spawn_seeds("test", spawns))
-    floors = [row for row in load_rows(out / "floors.parquet") if row.agent in FLOORS and row.seed in seeds]
-    # On more spawns than they drove they would be compared with others' driving elsewhere.
-    floors = floors if {row.seed for row in floors} == seeds else []
-    references = [TEACHER] if floors else [*FLOORS, TEACHER]
     rows: list[EpisodeRow] = []
     own: list[EpisodeRow] = []
     for scenario in scenarios:
         pattern = f"{data or scenario}/seed-*/rows/{scenario}-{spawns}-*.parquet"
-        references_here = [reference_rows(work, scenario, spawns, name) for name in references]
-        paths = [*references_here, *sorted(work.glob(pattern))]
+        floors = {name: floor_rows(out, scenario, spawns, name) for name in FLOORS}
+        missing = [name for name in (*FLOORS, pipeline.TEACHER) if not floors.get(name)]
+        paths = [*(reference_rows(work, scenario, spawns, name) for name in missing), *sorted(work.glob(pattern))]
         here = [row for path in paths if path.exists() for row in load_rows(path)]
         own += here
-        rows += [row for row in floors if row.scenario == scenario] + here
+        rows += [row for of in floors.values() for row in of] + here
     if not own:
         raise SystemExit(f"Nothing has been measured over {spawns} spawns under '{work}'. Train first: see --help.")
     marks = {
@@ -683,8 +689,10 @@ def main() -> None:
         if chosen.ppo or chosen.vehicles:
             ppo = replace(config.adapt.ppo, steps=chosen.ppo)
             pipeline.check(replace(config, adapt=replace(config.adapt, ppo=ppo, vehicles=chosen.vehicles)))
-        references = [*chosen.floors, *([TEACHER] if chosen.teacher else [])]
-        measure_references(work, references, chosen.scenarios, chosen.spawns)
+        if chosen.vehicles:
+            check_widening(config.network, chosen.vehicles)
+        references = [*chosen.floors, *([pipeline.TEACHER] if chosen.teacher else [])]
+        measure_references(work, chosen.out, references, chosen.scenarios, chosen.spawns)
         for seed in chosen.seeds:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario

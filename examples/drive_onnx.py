@@ -7,11 +7,12 @@ import numpy as np
 import onnxruntime
 
 import rapid
+from rapid.scenarios import seeing
 
 session = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
 lanes = json.loads(session.get_modelmeta().custom_metadata_map["rapid"])["lanes"]
 scenario = {3: "lane-3-density-2", 4: "lane-4-density-2.5", 5: "lane-5-density-3"}[lanes]
-env = rapid.make_env(scenario, config={"observation": {"vehicles_count": session.get_inputs()[0].shape[1]}})
+env = rapid.make_env(scenario, config=seeing(session.get_inputs()[0].shape[1]))
 returns = []
 for episode in range(int(sys.argv[2]) if len(sys.argv) > 2 else 5):
     obs, _ = env.reset(seed=episode)

@@ -22,6 +22,9 @@ from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.rollouts import run_episodes
+from rapid.networks.agent import QAgent
+from rapid.networks.q_network import build_network
+from rapid.scenarios import SLOWER
 from rapid.settings import apply_overrides
 from rapid.training.diagnostics import FORGETTING_STATES
 from rapid.training.record import load_metrics
@@ -258,7 +261,9 @@ def test_a_run_whose_agent_sees_more_than_the_others_has_its_page(config: Config
     assert "after adaptation" in (tmp_path / "run/report.html").read_text()
 
 
-def test_from_phase_3_on_more_may_be_seen(config: Config, finished: Path, tmp_path: Path):
+def test_from_phase_3_on_more_may_be_seen(
+    config: Config, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     start = finished / "distill/rapid/agent"
     adapt = replace(config.adapt, vehicles=31)
     pipeline.adapt_agent(replace(config, adapt=adapt), start, finished / "mix", tmp_path / "far")
@@ -271,6 +276,15 @@ def test_from_phase_3_on_more_may_be_seen(config: Config, finished: Path, tmp_pa
     assert row.obs_TVF[0, 15:, 0].any()
     near = np.where(np.arange(31)[:, None] < 15, row.obs_TVF, 0)
     assert (agent.q_values(row.obs_TVF) != agent.q_values(near)).any()
+    # How close it comes is told of the usual rows, whatever it reads.
+    for vehicles in (5, 31):
+        other = QAgent(build_network(replace(config.network, vehicles=vehicles), 3, 0))
+        usual = QAgent(build_network(config.network, 3, 0))
+        for one in (usual, other):
+            monkeypatch.setattr(one, "act", lambda obs_BVF: np.full(len(obs_BVF), SLOWER))
+            monkeypatch.setattr(one, "q_values", lambda obs_BVF: np.eye(5, dtype=np.float32)[[SLOWER] * len(obs_BVF)])
+        ours, theirs = (run_episodes(one, config.scenario, range(900_000, 900_020)) for one in (other, usual))
+        assert np.array_equal(ours.min_ttc_E, theirs.min_ttc_E, equal_nan=True)
     # Once it sees so far it goes on so, by itself or told the same; it cannot go back.
     for vehicles, out in ((0, "kept"), (31, "told")):
         adapt = replace(config.adapt, vehicles=vehicles, ppo=PpoConfig())

@@ -1,6 +1,7 @@
 """The scores' script: what it takes for trained, and what its table compares."""
 
 import importlib.util
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import pytest
 
 from rapid.config import preset
 from rapid.errors import RapidError
+from rapid.evaluation.agents import open_agent
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.agent import save_agent
 from rapid.networks.q_network import build_network
 from rapid.settings import to_dict
+from rapid.spawns import spawn_seeds
 from rapid.teacher.scripted import Scripted
 
 SCRIPTED = Scripted("slower", 3, 0)
@@ -258,6 +261,42 @@ def test_each_recipe_and_reward_has_a_table_of_its_own(benchmark, config, tmp_pa
         benchmark.table(tmp_path, [scenario], "", 1, config, tmp_path)
     assert {path.stem for path in tmp_path.glob("scores*.md")} >= {"scores", "scores-progress"}
     assert "the commits c0ffee0." in (tmp_path / "scores.md").read_text()
+
+
+def test_floors_drive_where_they_have_not_and_are_in_the_table(benchmark, config, tmp_path):
+    scenarios = ["lane-3-density-2", "lane-3-density-2-fast"]
+    # There are rows of the first scenario alone, and of the rule's driving on fewer spawns.
+    had = run_episodes(open_agent("slower", scenarios[0]), scenarios[0], spawn_seeds("test", 2)).rows()
+    part = run_episodes(open_agent("rule", scenarios[0]), scenarios[0], spawn_seeds("test", 1)).rows()
+    benchmark.save_rows(tmp_path / "floors.parquet", [*had, *part])
+    benchmark.measure_references(tmp_path, tmp_path, ["slower", "rule"], scenarios, 2)
+    driven = {path.name for path in (tmp_path / "rows").iterdir()}
+    assert driven == {f"{scenario}-2-rule.parquet" for scenario in scenarios} | {f"{scenarios[1]}-2-slower.parquet"}
+    benchmark.table(tmp_path, scenarios, "", 2, config, tmp_path)
+    page = (tmp_path / "scores-2.md").read_text()
+    assert page.count("\nalways-slower ") == page.count("\nrule ") == 2
+
+
+def test_an_agent_is_compared_with_where_it_began_and_with_its_like(benchmark, config):
+    begun = "RAPID, 300K"
+    names = [begun, f"{begun}, 31 seen", f"{begun} + 700K PPO", f"{begun}, 31 seen + 700K PPO"]
+    names += [f"{begun} + 700K PPO, fine-tuned whole", f"{begun}, 31 seen + 700K PPO, mirrored"]
+    names += ["online Munchausen DQN, 300K + 700K PPO"]
+    rows = run_episodes(SCRIPTED, "lane-3-density-2", [0, 1]).rows(0)
+    page = benchmark.report([replace(row, agent=n) for n in names for row in rows], config, "", 2, "command")
+    pairs = re.findall(r"^- (.*) against (.*), paired", page, re.MULTILINE)
+    assert len(pairs) == len(set(pairs))
+    assert set(pairs) == {
+        (names[1], names[0]),
+        (names[2], names[0]),
+        (names[2], names[6]),
+        (names[2], names[4]),
+        (names[3], names[1]),
+        (names[3], names[2]),
+        (names[3], names[6]),
+        (names[4], names[0]),
+        (names[5], names[3]),
+    }
 
 
 def test_the_recipe_paper_has_its_online_dqn_as_printed(benchmark, tmp_path, asked):

@@ -155,8 +155,8 @@ class NetworkConfig:
     mask_absent: bool = True
     """Whether rows with presence 0 are hidden from attention, so that their contents never matter."""
     vehicles: int = NUM_VEHICLES
-    """V: rows that it reads, the ego's and those of the nearest others. Of observations with more it reads the first;
-    those with fewer are as if the rest of the road were empty."""
+    """V: rows that it reads, the ego's and those of the nearest others. Of data with more it learns from the first;
+    data with fewer is as if the rest of the road were empty."""
     mirror: bool = False
     """Average the Q-values with those of the mirrored road, left and right swapped back, which takes twice the time.
     For the reward `progress`, on as many lanes as it was trained on: the paper's reward pays more on the right."""
@@ -319,7 +319,8 @@ class AdaptConfig:
     freeze_decoder: bool = False
     """Also freeze the action decoder."""
     vehicles: int = 0
-    """Set `network.vehicles` from this phase on, whatever the data has, to see farther; 0 leaves it as it is."""
+    """Set `network.vehicles` from this phase on, whatever the data has, to see farther; 0 leaves it as it is. At least
+    what it was, for a network of tokens that masks absent rows and has no position learned for each."""
     mirror: bool = False
     """Set `network.mirror` from this phase on; without this an agent keeps what it has."""
     evaluate_every: int = 1_000

@@ -1,6 +1,6 @@
 """Agents as ONNX: one file that any ONNX runtime drives with, no RAPID and no torch needed.
 
-The model reads `obs` (batch, 15, 5), float32, raw as the environment gives it, and returns `q` (batch, 5).
+The model reads `obs` (batch, V, 5), float32, raw as the environment gives it, and returns `q` (batch, 5).
 """
 
 import json
@@ -16,7 +16,7 @@ from rapid import files
 from rapid.errors import RapidError
 from rapid.graph import build_model
 from rapid.networks.agent import QAgent, check_observations
-from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
+from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, MIN_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
 
 METADATA_KEY = "rapid"
 TOLERANCE = 1e-4
@@ -27,7 +27,7 @@ class OnnxAgent:
     """Drives greedily by an ONNX model, on one thread.
 
     Args:
-        path: the model, made by :func:`export_onnx` or by anyone: its one input takes observations (batch, 15, 5),
+        path: the model, made by :func:`export_onnx` or by anyone: its one input takes observations (batch, V, 5),
             flattened or not, and its first output gives Q-values (batch, 5).
         name: the name shown in tables; the file's by default.
 
@@ -51,7 +51,7 @@ class OnnxAgent:
         inputs, outputs = self.session.get_inputs(), self.session.get_outputs()
         self.input, self.output = inputs[0].name, outputs[0].name
         shape = list(inputs[0].shape)
-        sizes = range(1, MAX_VEHICLES + 1)
+        sizes = range(MIN_VEHICLES, MAX_VEHICLES + 1)
         found = [size for size in sizes if shape[1:] in ([size, NUM_FEATURES], [size * NUM_FEATURES])]
         if len(inputs) != 1 or not found:
             raise RapidError(

@@ -22,8 +22,8 @@ FEATURES = ("presence", "x", "y", "vx", "vy")
 """The columns of an observation row; a row is a vehicle, the first row is the ego."""
 NUM_VEHICLES = 15
 """Rows of an observation, unless an agent wants more."""
-MAX_VEHICLES = 51
-"""Vehicles on the road: the ego and 50 others."""
+MIN_VEHICLES, MAX_VEHICLES = 2, 51
+"""Rows that an observation may have; 51 are all vehicles of ``highway-v0``, of ``highway-fast-v0`` 21 are."""
 NUM_FEATURES = len(FEATURES)
 NUM_ACTIONS = len(ACTIONS)
 

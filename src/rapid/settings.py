@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 
 from rapid.config import Config, PpoConfig
 from rapid.errors import RapidError, did_you_mean
-from rapid.scenarios import MAX_VEHICLES, get_scenario
+from rapid.scenarios import MAX_VEHICLES, MIN_VEHICLES, get_scenario
 
 T = TypeVar("T")
 
@@ -224,7 +224,11 @@ def validate(config: Config) -> Config:
             network.heads < 1 or network.width % network.heads == 0,
             f"a multiple of network.heads = {network.heads}",
         ),
-        ("network.vehicles", 1 <= network.vehicles <= MAX_VEHICLES, f"between 1 and {MAX_VEHICLES}"),
+        (
+            "network.vehicles",
+            MIN_VEHICLES <= network.vehicles <= MAX_VEHICLES,
+            f"between {MIN_VEHICLES} and {MAX_VEHICLES}",
+        ),
         ("adapt.vehicles", 0 <= adapt.vehicles <= MAX_VEHICLES, f"between 0 and {MAX_VEHICLES}"),
         ("evaluate.attacks", len(config.evaluate.attacks) >= 1, "at least one name, such as none"),
     ]

@@ -458,8 +458,10 @@ def _teach_bench(options: TeachBench, config: Config) -> int:
 
 
 def _export(options: Export, config: Config) -> int:
+    import torch
+
+    from rapid.data.batch import with_rows
     from rapid.data.dataset import load_dataset
-    from rapid.data.transitions import with_rows
     from rapid.export import driven_observations, export_onnx, latency
     from rapid.networks.agent import load_agent
     from rapid.spawns import spawn_seeds
@@ -467,7 +469,8 @@ def _export(options: Export, config: Config) -> int:
     agent, folder = load_agent(options.agent), Path(options.agent)
     out = options.out or f"{folder.resolve()}.onnx"
     if options.dataset:
-        obs_BVF = with_rows(load_dataset(options.dataset).transitions.obs_NVF, agent.vehicles)
+        obs_NVF = load_dataset(options.dataset).transitions.obs_NVF
+        obs_BVF = with_rows(torch.from_numpy(obs_NVF), agent.vehicles).numpy()
     else:
         scenario = str(agent.metadata.get("scenario") or config.scenario)
         obs_BVF = driven_observations(agent, scenario, spawn_seeds("test", 32))

@@ -70,6 +70,22 @@ def test_in_phase_2_adapters_are_not_run_and_in_phase_3_they_are(roads):
     assert calls == [0]
 
 
+def test_a_recording_leaves_out_adapters_whose_gate_stays_closed_alone(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
+    network = make()
+    mixture, weights = mixture_of(network), type("OnAGpu", (), {"is_cuda": True})()
+
+    def recorded(phase: str) -> bool:
+        set_phase(network, phase)
+        return mixture._runs(1, weights)
+
+    # A gate that is trained may open while the recording is replayed.
+    assert [recorded(phase) for phase in ("distill", "adapt", "all", "distill")] == [False, True, True, False]
+    open_gate(network)
+    assert recorded("distill")
+    assert mixture._runs(0, weights)
+
+
 def test_a_policy_that_no_vehicle_chose_is_skipped_bit_equally(roads):
     network = open_gate(make(num_policies=4, top_k=2))
     mixture = mixture_of(network)

@@ -136,7 +136,8 @@ def test_a_widened_network_is_the_same_until_there_is_more_to_see(roads, positio
         ({"kind": "mlp"}, 31, "weights for each of its 15 vehicles"),
         ({"position": "learned"}, 31, "weights for each of its 15 vehicles"),
         ({}, 14, "reads 15 vehicles"),
-        ({}, 52, "between 1 and 51"),
+        ({"mask_absent": False}, 31, "attends to rows of absent vehicles"),
+        ({}, 52, "between 2 and 51"),
     ],
 )
 def test_what_cannot_be_widened_says_why(settings, vehicles, says):
@@ -226,7 +227,7 @@ def test_phases_of_the_baselines():
         {"heads": 3},
         {"layers": 0},
         {"decoder_layers": 0},
-        {"vehicles": 0},
+        {"vehicles": 1},
         {"vehicles": 52},
     ],
 )

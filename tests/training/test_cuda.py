@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from rapid.config import Config, LossConfig, OptimizerConfig, preset
+from rapid.data.batch import with_rows
 from rapid.data.dataset import load_dataset, mix
 from rapid.data.replay import OfflineSampler
-from rapid.data.transitions import with_rows
 from rapid.networks.agent import load_agent, save_agent
 from rapid.networks.q_network import build_network, set_phase, widened
 from rapid.training import offline
@@ -165,5 +165,5 @@ def test_phase_3_trains_there_and_the_agent_drives_on_a_cpu(transitions, tmp_pat
     assert "head.mixture.gate_NV" not in same
     save_agent(tmp_path / "agent", network, {})
     there, here = load_agent(tmp_path / "agent", "cuda"), load_agent(tmp_path / "agent")
-    obs_BVF = with_rows(transitions.obs_NVF[:20], 20)
+    obs_BVF = with_rows(torch.from_numpy(transitions.obs_NVF[:20]), 20).numpy()
     np.testing.assert_allclose(there.q_values(obs_BVF), here.q_values(obs_BVF), rtol=1e-3, atol=1e-3)

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from torch import Tensor
+from torch.nn import functional
 
 
 class TransitionBatch(NamedTuple):
@@ -23,3 +24,10 @@ class TransitionBatch(NamedTuple):
     """bool: the teacher chose the action."""
     soft_BA: Tensor | None = None
     """float32: the teacher's probability of every action, rows of NaN where it gave none; None if nobody gave any."""
+
+
+def with_rows(obs_BVF: Tensor, vehicles: int) -> Tensor:
+    """Return observations with so many rows: the nearest vehicles, which come first, and after them absent ones."""
+    missing = vehicles - obs_BVF.shape[1]
+    # Padding by less than nothing cuts off.
+    return functional.pad(obs_BVF, (0, 0, 0, missing)) if missing else obs_BVF

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rapid.data.batch import TransitionBatch
-from rapid.data.transitions import TEACHER, Transitions, with_rows
+from rapid.data.batch import TransitionBatch, with_rows
+from rapid.data.transitions import TEACHER, Transitions
 from rapid.errors import RapidError
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
 
@@ -79,10 +79,10 @@ class OfflineSampler:
             return torch.from_numpy(np.ascontiguousarray(array)).to(device)
 
         self.store = TransitionBatch(
-            tensor(with_rows(transitions.obs_NVF, vehicles)),
+            with_rows(tensor(transitions.obs_NVF), vehicles),
             tensor(transitions.action_N),
             tensor(reward_N),
-            tensor(with_rows(transitions.next_obs_NVF[last_N], vehicles)),
+            with_rows(tensor(transitions.next_obs_NVF[last_N]), vehicles),
             tensor(bootstrap_N),
             tensor(teacher_N),
             None if np.isnan(soft).all() else tensor(soft),

@@ -29,11 +29,6 @@ _SHAPES: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
 }
 
 
-def with_rows(obs_NVF: NDArray[np.float32], vehicles: int) -> NDArray[np.float32]:
-    """Return observations with so many rows: the nearest vehicles, which come first, and after them absent ones."""
-    return np.pad(obs_NVF[:, :vehicles], ((0, 0), (0, max(vehicles - obs_NVF.shape[1], 0)), (0, 0)))
-
-
 @dataclass(frozen=True)
 class Transitions:
     """N transitions as arrays; the steps of an episode need not be complete nor in order (a mixture drops some)."""

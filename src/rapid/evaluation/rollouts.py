@@ -109,9 +109,10 @@ def run_episodes(
     """Drive one episode for each spawn seed and return what was measured.
 
     `agent` has ``act(obs_BVF) -> actions``, or is a teacher with ``decide``, or needs the worlds themselves and has
-    ``bind(env) -> agent``. `attack` is an attack or its name. `progress` is called with the number of episodes that
-    have just ended. The noise of an episode depends on `generator_seed`, its spawn seed and the step, not on the
-    episodes beside it; only a gradient attack with a random start draws for all worlds of a step together.
+    ``bind(env) -> agent``; one that reads other than 15 vehicles has ``vehicles``. `attack` is an attack or its name.
+    `progress` is called with the number of episodes that have just ended. The noise of an episode depends on
+    `generator_seed`, its spawn seed and the step, not on the episodes beside it; only a gradient attack with a random
+    start draws for all worlds of a step together.
 
     Raises:
         RapidError: no seeds, an attack that cannot be made on the agent (see :func:`is_applicable`), or a road that the
@@ -128,15 +129,17 @@ def run_episodes(
             f"The attack '{attack_name}' cannot be made on '{_name(agent)}': a gradient attack needs a network, and an "
             "agent that reads the worlds themselves sees no observation. Leave this cell out: it is not applicable."
         )
+    vehicles = getattr(agent, "vehicles", NUM_VEHICLES)
+    shown = seeing(max(vehicles, NUM_VEHICLES))
     parts: list[Worlds] = []
     together = PLANNED_WORLDS if kind_of(agent) == "planner" else MAX_WORLDS
     for first in range(0, len(seeds), together):
         worlds = Worlds(np.asarray(seeds[first : first + together], np.int64), record)
-        seen = seeing(getattr(agent, "vehicles", NUM_VEHICLES))
-        env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, config=seen, autoreset=False)
+        env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, config=shown, autoreset=False)
         try:
             driver = driver_for(agent, env, generator_seed)
-            worlds.drive(env, driver, Perturbation(resolved, network, generator_seed, worlds.seed_B), lanes, progress)
+            perturbation = Perturbation(resolved, network, generator_seed, worlds.seed_B)
+            worlds.drive(env, driver, perturbation, lanes, progress, vehicles)
         finally:
             env.close()
         parts.append(worlds)

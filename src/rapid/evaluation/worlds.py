@@ -13,7 +13,7 @@ from rapid.errors import RapidError
 from rapid.evaluation.agents import Driver
 from rapid.evaluation.metrics import time_to_collision
 from rapid.evaluation.recording import Recording
-from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS
+from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS, NUM_VEHICLES
 from rapid.seeding import torch_stream
 
 
@@ -74,19 +74,20 @@ class Worlds:
         perturb: Perturbation,
         lanes: int,
         progress: Callable[[float], None] | None,
+        vehicles: int = NUM_VEHICLES,
     ) -> None:
-        """Step all worlds until every one has ended."""
+        """Step all worlds until every one has ended; the driver sees the first `vehicles` rows of an observation."""
         obs_BVF, _ = env.reset(seed=self.seed_B.tolist())
         obs_BVF = np.array(obs_BVF, np.float32)
         start_B = obs_BVF[:, 0, 1].astype(np.float64)
         lane_B = _lane(obs_BVF, lanes)
-        self.ttc_B = np.minimum(self.ttc_B, time_to_collision(obs_BVF))
+        self.ttc_B = np.minimum(self.ttc_B, _time_to_collision(obs_BVF))
         alive_B = np.ones(len(self.seed_B), np.bool_)
         step = 0
         while alive_B.any():
             worlds = np.flatnonzero(alive_B)
-            seen_BVF = obs_BVF.copy()
-            seen_BVF[worlds] = perturb(obs_BVF[worlds], worlds)
+            seen_BVF = obs_BVF[:, :vehicles].copy()
+            seen_BVF[worlds] = perturb(seen_BVF[worlds], worlds)
             began = time.perf_counter()
             chosen = driver.choose(seen_BVF, worlds, self.seed_B, step)
             self.decision_seconds += time.perf_counter() - began
@@ -109,7 +110,7 @@ class Worlds:
             new_lane_B = _lane(obs_BVF, lanes)
             self.lane_changes_B[worlds] += (new_lane_B != lane_B)[worlds]
             lane_B = new_lane_B
-            self.ttc_B[worlds] = np.minimum(self.ttc_B[worlds], time_to_collision(obs_BVF[worlds]))
+            self.ttc_B[worlds] = np.minimum(self.ttc_B[worlds], _time_to_collision(obs_BVF[worlds]))
             if self._steps is not None:
                 for world in worlds:
                     last = self._steps[world][-1]
@@ -160,6 +161,11 @@ class _Step:
     said: str
     reward: float = 0.0
     after: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+
+def _time_to_collision(obs_BVF: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return it for the usual rows, so that it is the same for who reads more or fewer."""
+    return time_to_collision(obs_BVF[:, :NUM_VEHICLES])
 
 
 def _lane(obs_BVF: NDArray[np.float32], lanes: int) -> NDArray[np.int64]:

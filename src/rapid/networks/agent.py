@@ -26,7 +26,7 @@ WEIGHTS_FILE = "weights.safetensors"
 
 
 class Agent(Protocol):
-    """Anything that chooses actions from observations."""
+    """Anything that chooses actions from observations; of other than 15 vehicles, if it has an int `vehicles`."""
 
     @property
     def name(self) -> str:
@@ -192,7 +192,7 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
     if config.get("vehicles") != settings.vehicles:
         raise RapidError(
             f"The agent '{folder}' is damaged: {CONFIG_FILE} has {config.get('vehicles')} vehicles, and a network that "
-            f"reads {settings.vehicles}. Save it again."
+            f"reads {settings.vehicles}. Copy or train it again."
         )
     network = build_network(settings, lanes, seed=0)
     _load_weights(network, folder, config.get("weights_sha256"))

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from rapid.config import NetworkConfig
+from rapid.data.batch import with_rows
 from rapid.errors import RapidError
 from rapid.networks.blocks import Transformer
 from rapid.networks.encoding import Encoding
 from rapid.networks.mixture import MixtureOfPolicies
 from rapid.networks.mlp import MlpHead, MlpStack
-from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, MAX_VEHICLES, NUM_ACTIONS, SLOWER
+from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, MAX_VEHICLES, MIN_VEHICLES, NUM_ACTIONS, SLOWER
 from rapid.seeding import torch_stream
 
 Phase = Literal["distill", "adapt", "all"]
@@ -154,18 +155,11 @@ class QNetwork(nn.Module):
         return Explanation(q_BA, q_without_BVA, weights_BVN, router_BVN, gate_NV, attention_BLHV)
 
 
-def with_rows(obs_BVF: Tensor, vehicles: int) -> Tensor:
-    """Return observations with so many rows: the nearest vehicles, which come first, and after them absent ones."""
-    missing = vehicles - obs_BVF.shape[1]
-    # Padding by less than nothing cuts off.
-    return nn.functional.pad(obs_BVF, (0, 0, 0, missing)) if missing else obs_BVF
-
-
 def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
     """Return a new network whose weights depend on `config` and `seed` alone, with every parameter trainable.
 
     Raises:
-        RapidError: N < 1, K outside 1..N, a width that the heads do not divide, or more vehicles than there are.
+        RapidError: N < 1, K outside 1..N, a width that the heads do not divide, or vehicles outside 2..51.
     """
     if config.num_policies < 1 or not 1 <= config.top_k <= config.num_policies:
         raise RapidError(
@@ -178,10 +172,10 @@ def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
             f"{config.decoder_layers} layers cannot be built: "
             "the width must be a multiple of the heads, with at least one head and one layer."
         )
-    if not 1 <= config.vehicles <= MAX_VEHICLES:
+    if not MIN_VEHICLES <= config.vehicles <= MAX_VEHICLES:
         raise RapidError(
-            f"A network that reads vehicles V = {config.vehicles} cannot be built: V must be between 1 and "
-            f"{MAX_VEHICLES}, all that are on the road."
+            f"A network that reads vehicles V = {config.vehicles} cannot be built: V must be between {MIN_VEHICLES} "
+            f"and {MAX_VEHICLES}, as many rows as an observation can have."
         )
     # The constructors draw from the global stream; every such value is overwritten below, so its state is kept.
     with torch.random.fork_rng(devices=[]):
@@ -194,19 +188,25 @@ def check_widening(config: NetworkConfig, vehicles: int) -> None:
     """Check that a network of these settings can be `widened` to so many rows.
 
     Raises:
-        RapidError: it reads more, or it has weights for every row.
+        RapidError: it reads more, it has weights for every row, or it would attend to rows that are absent.
     """
     if vehicles < config.vehicles:
         raise RapidError(
-            f"adapt.vehicles is {vehicles}, but the network reads {config.vehicles} vehicles and has learned a gate "
-            f"for each. Set it to {config.vehicles} to {MAX_VEHICLES}, or to 0 to leave them as they are."
+            f"adapt.vehicles is {vehicles}, but the network reads {config.vehicles} vehicles already. Set it to "
+            f"{config.vehicles} to {MAX_VEHICLES}, or to 0 to leave them as they are."
         )
-    per_row = config.kind not in ("rapid", "attentive") or config.position == "learned"
-    if vehicles > config.vehicles and per_row:
+    why = ""
+    if config.kind not in ("rapid", "attentive") or config.position == "learned":
+        why = (
+            f"of kind '{config.kind}' and position '{config.position}' has weights for each of its {config.vehicles} "
+            "vehicles and none for more"
+        )
+    elif not config.mask_absent:
+        why = "without mask_absent attends to rows of absent vehicles, so that more of them change what it does"
+    if why and vehicles > config.vehicles:
         raise RapidError(
-            f"adapt.vehicles is {vehicles}, but a network of kind '{config.kind}' and position '{config.position}' has "
-            f"weights for each of its {config.vehicles} vehicles and none for more. Set network.vehicles to {vehicles} "
-            "when it is distilled, or adapt.vehicles to 0."
+            f"adapt.vehicles is {vehicles}, but a network {why}. Set network.vehicles to {vehicles} when it is "
+            "distilled, or adapt.vehicles to 0."
         )
 
 
@@ -216,7 +216,7 @@ def widened(network: QNetwork, vehicles: int) -> QNetwork:
     The gates of the new rows, which are those farthest away, are that of the last row it had.
 
     Raises:
-        RapidError: fewer rows than it reads, or a network with weights for every row.
+        RapidError: what :func:`check_widening` refuses.
     """
     config = network.config
     check_widening(config, vehicles)
