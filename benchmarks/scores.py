@@ -437,12 +437,14 @@ def measure(
         save_rows(path, rows)
 
 
-def measure_references(work: Path, out: Path, names: Iterable[str], scenarios: Sequence[str], spawns: int) -> None:
+def measure_references(
+    work: Path, floors: list[EpisodeRow], names: Iterable[str], scenarios: Sequence[str], spawns: int
+) -> None:
     """Drive what learns nothing here where it has not: floors and planners by their names, and the default teacher."""
     for name in names:
         for scenario in scenarios:
             path = reference_rows(work, scenario, spawns, name)
-            if path.exists() or floor_rows(out, scenario, spawns, name):
+            if path.exists() or floor_rows(floors, scenario, spawns, name):
                 continue
             if name == pipeline.TEACHER:
                 driver = make_teacher(TeacherConfig(), get_scenario(scenario).lanes, 0)
@@ -455,10 +457,9 @@ def measure_references(work: Path, out: Path, names: Iterable[str], scenarios: S
             save_rows(path, rows)
 
 
-def floor_rows(out: Path, scenario: str, spawns: int, name: str) -> list[EpisodeRow]:
-    """Return a floor's rows in `floors.parquet`; none if it has not driven all of these spawns there."""
-    rows = [row for row in load_rows(out / "floors.parquet") if (row.agent, row.scenario) == (name, scenario)]
-    driven = {row.seed: row for row in rows}
+def floor_rows(floors: list[EpisodeRow], scenario: str, spawns: int, name: str) -> list[EpisodeRow]:
+    """Return one floor's rows among `floors`; none if it has not driven all of these spawns there."""
+    driven = {row.seed: row for row in floors if (row.agent, row.scenario) == (name, scenario)}
     seeds = spawn_seeds("test", spawns)
     return [driven[seed] for seed in seeds] if set(seeds) <= driven.keys() else []
 
@@ -600,16 +601,17 @@ def beside_paper(rows: list[EpisodeRow], scenario: str) -> list[str]:
 
 def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Config, out: Path) -> None:
     """Write what has been measured so far."""
+    floors = load_rows(out / "floors.parquet")
     rows: list[EpisodeRow] = []
     own: list[EpisodeRow] = []
     for scenario in scenarios:
         pattern = f"{data or scenario}/seed-*/rows/{scenario}-{spawns}-*.parquet"
-        floors = {name: floor_rows(out, scenario, spawns, name) for name in FLOORS}
-        missing = [name for name in (*FLOORS, pipeline.TEACHER) if not floors.get(name)]
+        driven = {name: floor_rows(floors, scenario, spawns, name) for name in FLOORS}
+        missing = [name for name in (*FLOORS, pipeline.TEACHER) if not driven.get(name)]
         paths = [*(reference_rows(work, scenario, spawns, name) for name in missing), *sorted(work.glob(pattern))]
         here = [row for path in paths if path.exists() for row in load_rows(path)]
         own += here
-        rows += [row for of in floors.values() for row in of] + here
+        rows += [row for of in driven.values() for row in of] + here
     if not own:
         raise SystemExit(f"Nothing has been measured over {spawns} spawns under '{work}'. Train first: see --help.")
     marks = {
@@ -692,7 +694,7 @@ def main() -> None:
         if chosen.vehicles:
             check_widening(config.network, chosen.vehicles)
         references = [*chosen.floors, *([pipeline.TEACHER] if chosen.teacher else [])]
-        measure_references(work, chosen.out, references, chosen.scenarios, chosen.spawns)
+        measure_references(work, load_rows(chosen.out / "floors.parquet"), references, chosen.scenarios, chosen.spawns)
         for seed in chosen.seeds:
             for scenario in chosen.scenarios:
                 data = chosen.data or scenario

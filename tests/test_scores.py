@@ -269,7 +269,7 @@ def test_floors_drive_where_they_have_not_and_are_in_the_table(benchmark, config
     had = run_episodes(open_agent("slower", scenarios[0]), scenarios[0], spawn_seeds("test", 2)).rows()
     part = run_episodes(open_agent("rule", scenarios[0]), scenarios[0], spawn_seeds("test", 1)).rows()
     benchmark.save_rows(tmp_path / "floors.parquet", [*had, *part])
-    benchmark.measure_references(tmp_path, tmp_path, ["slower", "rule"], scenarios, 2)
+    benchmark.measure_references(tmp_path, [*had, *part], ["slower", "rule"], scenarios, 2)
     driven = {path.name for path in (tmp_path / "rows").iterdir()}
     assert driven == {f"{scenario}-2-rule.parquet" for scenario in scenarios} | {f"{scenarios[1]}-2-slower.parquet"}
     benchmark.table(tmp_path, scenarios, "", 2, config, tmp_path)

@@ -15,14 +15,14 @@ from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
-from rapid.scenarios import get_scenario, seeing
+from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.training.adam import flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import Learner
 from rapid.training.offline import check_labels, data_fingerprint
 from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
-from rapid.training.worlds import Drive, Explorer, MakeWorlds
+from rapid.training.worlds import Drive, Explorer, MakeWorlds, default_worlds
 
 LOG_EVERY = 1_000
 """Environment steps between two lines of metrics."""
@@ -100,7 +100,7 @@ def adapt(
         OfflineSampler(offline, loss.discount, 1, device, vehicles=vehicles) if offline and offline_count else None
     )
     rng = numpy_stream(seed, "adapt/exploration and batches")
-    drive = Drive(make_worlds or _default_worlds(scenario, vehicles), worlds_count, seed)
+    drive = Drive(make_worlds or default_worlds(scenario, vehicles), worlds_count, seed)
     explorer = Explorer(worlds_count, config.exploration_hold)
     timed = get_scenario(scenario).clock
     steps = 0
@@ -188,9 +188,3 @@ def _check(config: AdaptConfig, offline: Transitions | None) -> int:
             )
         check_labels(offline, config.loss, config.optimizer.algorithm)
     return count
-
-
-def _default_worlds(scenario: str, vehicles: int) -> MakeWorlds:
-    from rapid.simulator import make_vec
-
-    return lambda count: make_vec(scenario, count, config=seeing(vehicles))

@@ -21,14 +21,14 @@ from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
-from rapid.scenarios import Scenario, get_scenario, seeing
+from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.settings import least_steps
 from rapid.training.adam import Adam, clip_norm, flush_denormals
 from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import check_generator
 from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
-from rapid.training.worlds import Drive, MakeWorlds
+from rapid.training.worlds import Drive, MakeWorlds, default_worlds
 
 VALUE_SCALE = 10.0
 """By what the critic's output is multiplied: returns of 30 s reach some 30."""
@@ -112,7 +112,7 @@ def adapt_by_ppo(
     )
     set_phase(network, "adapt" if config.train == "adapter" else "all", config.freeze_decoder)
     learner = PpoLearner(network, ppo, config.optimizer.gate_rate, seen.clock, seed, rollouts)
-    make_worlds = make_worlds or _default_worlds(replace(seen, clock=True), network.config.vehicles)
+    make_worlds = make_worlds or default_worlds(replace(seen, clock=True), network.config.vehicles)
     drive = Drive(make_worlds, ppo.num_envs, stream_seed(seed, "ppo"))
     sampler = torch_stream(seed, "ppo/actions", device)
     before = -(-config.steps // config.num_envs) * config.num_envs
@@ -344,9 +344,3 @@ def without_clock(obs_BVF: Tensor) -> Tensor:
 def _critic(config: NetworkConfig) -> NetworkConfig:
     """Return the settings of the critic's network: a single policy of the same size, or an MLP."""
     return replace(config, kind="mlp" if config.kind.startswith("mlp") else "attentive")
-
-
-def _default_worlds(scenario: Scenario, vehicles: int) -> MakeWorlds:
-    from rapid.simulator import make_vec
-
-    return lambda count: make_vec(scenario, count, config=seeing(vehicles))

@@ -8,12 +8,19 @@ import torch
 from numpy.typing import NDArray
 
 from rapid.networks.q_network import QNetwork
-from rapid.scenarios import NUM_ACTIONS
+from rapid.scenarios import NUM_ACTIONS, Scenario, seeing
 from rapid.seeding import stream_seed
 from rapid.spawns import train_part
 
 MakeWorlds = Callable[[int], Any]
 """Gives a vector environment of so many worlds with SAME_STEP autoreset."""
+
+
+def default_worlds(scenario: str | Scenario, vehicles: int) -> MakeWorlds:
+    """Return what makes compiled worlds of a scenario whose observations have so many rows."""
+    from rapid.simulator import make_vec
+
+    return lambda count: make_vec(scenario, count, config=seeing(vehicles))
 
 
 class Explorer:
