@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from rapid.agents.saved import QAgent
 from rapid.config import DistillConfig, NetworkConfig, preset
 from rapid.data.batch import TransitionBatch
 from rapid.data.dataset import Dataset, load_dataset, save_dataset
@@ -41,7 +42,6 @@ from rapid.evaluation.rollouts import run_episodes
 from rapid.evaluation.statistics import Estimate, estimate
 from rapid.files import cache_dir, write_json, write_text
 from rapid.losses import q_loss
-from rapid.networks.agent import QAgent
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.networks.stack import stack_networks
 from rapid.pipeline import baseline, collect_transitions

@@ -27,8 +27,8 @@ from rapid.networks.q_network import build_network, set_phase
 from rapid.progress import task
 from rapid.runs import commit
 from rapid.scenarios import get_scenario
-from rapid.training.adam import flush_denormals
 from rapid.training.learner import Learner
+from rapid.training.machinery.adam import flush_denormals
 from simulator import processor, shown
 
 WAYS = ("cpu", "cuda, step by step", "cuda, recorded")

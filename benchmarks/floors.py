@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rapid.evaluation.agents import open_agent
+from rapid.agents.open import open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import run_episodes
 from rapid.evaluation.statistics import Estimate, estimate

@@ -30,24 +30,24 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from rapid import pipeline
+from rapid.agents.open import open_agent
+from rapid.agents.saved import load_agent
 from rapid.config import AdaptConfig, Config, PpoConfig, TeacherConfig, preset
+from rapid.config_io import apply_overrides, to_dict
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
 from rapid.data.shipped import dataset_folder, shipped_sets
 from rapid.errors import RapidError
-from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import evaluate_agent
 from rapid.evaluation.statistics import Estimate, paired_difference
 from rapid.evaluation.summary import summary_text
 from rapid.files import write_text
-from rapid.networks.agent import load_agent
 from rapid.networks.q_network import check_widening
 from rapid.progress import task
 from rapid.report.data import paper_return
 from rapid.runs import commit
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
-from rapid.settings import apply_overrides, to_dict
 from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import make_teacher
 

@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 
 import rapid
+from rapid.agents.onnx import export_onnx, latency
 from rapid.data.dataset import load_dataset, summary
-from rapid.export import export_onnx, latency
 from rapid.files import write_json, write_text
 from rapid.progress import task
 from rapid.runs import commit

@@ -19,10 +19,10 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from rapid.agents.open import open_agent
 from rapid.attacks import NoiseAttack, in_units
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.evaluation.agents import open_agent
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import run_episodes
 from rapid.evaluation.statistics import Estimate, estimate, paired_difference

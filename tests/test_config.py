@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from rapid import config as settings
 from rapid.config import Config, preset
+from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate
 from rapid.errors import RapidError
-from rapid.settings import apply_overrides, load_toml, to_dict, to_toml, validate
 
 PRESETS = [(recipe, scale) for recipe in settings.RECIPES for scale in settings.SCALES]
 

@@ -17,17 +17,17 @@ import torch
 
 import rapid
 from rapid import pipeline
+from rapid.agents.saved import QAgent
 from rapid.config import Config, PpoConfig, preset
+from rapid.config_io import apply_overrides
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.rollouts import run_episodes
-from rapid.networks.agent import QAgent
 from rapid.networks.q_network import build_network
 from rapid.scenarios import SLOWER
-from rapid.settings import apply_overrides
-from rapid.training.diagnostics import FORGETTING_STATES
-from rapid.training.record import load_metrics
+from rapid.training.machinery.diagnostics import FORGETTING_STATES
+from rapid.training.machinery.record import load_metrics
 
 SMALL = {
     "teacher": {"backend": "scripted", "model": "rule"},

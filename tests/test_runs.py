@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from rapid.config import PpoConfig, preset
+from rapid.config_io import apply_overrides, load_toml
 from rapid.errors import RapidError
 from rapid.files import read_json
 from rapid.runs import RunDirectory
-from rapid.settings import apply_overrides, load_toml
 
 STEPS = ("collect", "mix", "distill")
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rapid.agents.open import open_agent
+from rapid.agents.saved import save_agent
 from rapid.config import preset
+from rapid.config_io import to_dict
 from rapid.errors import RapidError
-from rapid.evaluation.agents import open_agent
 from rapid.evaluation.rollouts import run_episodes
-from rapid.networks.agent import save_agent
 from rapid.networks.q_network import build_network
-from rapid.settings import to_dict
 from rapid.spawns import spawn_seeds
 from rapid.teacher.scripted import Scripted
 

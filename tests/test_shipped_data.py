@@ -8,6 +8,7 @@ import pytest
 
 from rapid import pipeline
 from rapid.config import Config, TeacherConfig, preset
+from rapid.config_io import apply_overrides
 from rapid.data.card import card
 from rapid.data.dataset import load_dataset
 from rapid.data.shipped import dataset_folder, shipped_sets
@@ -17,7 +18,6 @@ from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.teachers import drive_teacher
 from rapid.files import read_json
 from rapid.scenarios import PAPER_SCENARIOS
-from rapid.settings import apply_overrides
 from rapid.teacher import make_teacher
 from rapid.verbs import call
 

@@ -7,8 +7,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rapid.agents.saved import load_agent as load_agent
     from rapid.data.dataset import load_dataset as load_dataset
-    from rapid.networks.agent import load_agent as load_agent
     from rapid.simulator import make_env as make_env
     from rapid.simulator import make_vec as make_vec
 
@@ -16,7 +16,7 @@ __version__ = "0.1.0"
 __all__ = ["__version__", "load_agent", "load_dataset", "make_env", "make_vec"]
 
 _HOME = {
-    "load_agent": "rapid.networks.agent",
+    "load_agent": "rapid.agents.saved",
     "load_dataset": "rapid.data.dataset",
     "make_env": "rapid.simulator",
     "make_vec": "rapid.simulator",

@@ -4,7 +4,7 @@ A *recipe* says how things are trained: ``paper`` uses the numbers as printed, e
 ``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
 ``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps; in the
 recipe ``strong``, 700,000 by PPO after them).
-Precedence, low to high: recipe and scale, ``--config FILE.toml``, options (:mod:`rapid.settings`). This module imports
+Precedence, low to high: recipe and scale, ``--config FILE.toml``, options (:mod:`rapid.config_io`). This module imports
 nothing heavy.
 """
 

@@ -13,8 +13,11 @@ from typing import Any, Literal
 
 import torch
 
+from rapid.agents.open import PLANNERS, check_road, open_agent
+from rapid.agents.saved import QAgent, load_agent, save_agent
 from rapid.attacks import get_attack
 from rapid.config import Config, TeacherConfig, preset, without_place
+from rapid.config_io import apply_overrides, to_dict, validate
 from rapid.data.collection import Budget, collect, parse_shard
 from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset, summary
 from rapid.data.journal import exclusive
@@ -23,32 +26,29 @@ from rapid.data.shipped import SHIPPED, shipped_sets
 from rapid.data.transitions import Transitions
 from rapid.engines import check_engine
 from rapid.errors import RapidError, did_you_mean
-from rapid.evaluation.agents import PLANNERS, check_road, open_agent
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
+from rapid.experiments.paper import paper_numbers
 from rapid.files import read_json, sha256, write_json, write_text
-from rapid.networks.agent import QAgent, load_agent, save_agent
 from rapid.networks.q_network import QNetwork, build_network, check_widening, widened
 from rapid.networks.stack import stack_networks, unstack_networks
 from rapid.progress import format_seconds, task
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
-from rapid.reproduce import paper_numbers
 from rapid.runs import RunDirectory, commit
 from rapid.scenarios import get_scenario, seeing
 from rapid.seeding import stream_seed
-from rapid.settings import apply_overrides, to_dict, validate
 from rapid.simulator import make_vec
 from rapid.spawns import TrainPart, spawn_seeds
 from rapid.teacher import Teacher, check_teacher, make_teacher
 from rapid.teacher.models import is_present
 from rapid.tracking import Tracker, check_tracking
-from rapid.training.diagnostics import Forgetting
+from rapid.training.machinery.diagnostics import Forgetting
+from rapid.training.machinery.record import CHECKPOINT_FILE, load_metrics
 from rapid.training.offline import distill, is_stackable
 from rapid.training.online import adapt
 from rapid.training.ppo import adapt_by_ppo
-from rapid.training.record import CHECKPOINT_FILE, load_metrics
 
 STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
 FLOORS = ("slower", "idle", "random", "rule")

@@ -19,9 +19,9 @@ from typing import Any
 
 import rapid
 from rapid.config import Config, PpoConfig, preset, without_place
+from rapid.config_io import apply_overrides, to_dict, to_toml
 from rapid.errors import RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
-from rapid.settings import apply_overrides, to_dict, to_toml
 
 FORMAT = 1
 _PACKAGES = (

@@ -14,10 +14,11 @@ from typing import Any
 
 import torch
 
+from rapid.agents.open import open_agent
 from rapid.config import Config, TeacherConfig, preset
+from rapid.config_io import apply_overrides, load_toml, to_dict, validate
 from rapid.data.journal import exclusive
 from rapid.errors import RapidError, did_you_mean
-from rapid.evaluation.agents import open_agent
 from rapid.evaluation.teacher_summary import (
     TeacherSummary,
     summarize_teachers,
@@ -31,7 +32,6 @@ from rapid.progress import task
 from rapid.report.figures import save_figure, teachers_figure
 from rapid.runs import commit, versions
 from rapid.scenarios import get_scenario
-from rapid.settings import apply_overrides, load_toml, to_dict, validate
 from rapid.simulator import make_vec
 from rapid.spawns import SpawnSet, spawn_seeds
 from rapid.teacher import make_teacher, models

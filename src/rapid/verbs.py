@@ -28,9 +28,9 @@ from rapid.config import (
     preset,
     without_place,
 )
+from rapid.config_io import apply_overrides, load_toml, to_dict, validate
 from rapid.errors import RapidError
 from rapid.scenarios import PAPER_SCENARIOS, Reward, get_scenario
-from rapid.settings import apply_overrides, load_toml, to_dict, validate
 from rapid.tracking import Tracking
 
 T = TypeVar("T")
@@ -460,10 +460,10 @@ def _teach_bench(options: TeachBench, config: Config) -> int:
 def _export(options: Export, config: Config) -> int:
     import torch
 
+    from rapid.agents.onnx import driven_observations, export_onnx, latency
+    from rapid.agents.saved import load_agent
     from rapid.data.batch import with_rows
     from rapid.data.dataset import load_dataset
-    from rapid.export import driven_observations, export_onnx, latency
-    from rapid.networks.agent import load_agent
     from rapid.spawns import spawn_seeds
 
     agent, folder = load_agent(options.agent), Path(options.agent)

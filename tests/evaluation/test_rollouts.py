@@ -10,9 +10,9 @@ import pytest
 import torch
 
 import rapid
+from rapid.agents.open import kind_of, open_agent
 from rapid.errors import RapidError
 from rapid.evaluation import rollouts
-from rapid.evaluation.agents import kind_of, open_agent
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
 from rapid.evaluation.rollouts import evaluate_agent, is_applicable, run_episodes
 from rapid.scenarios import FASTER, IDLE, LANE_RIGHT

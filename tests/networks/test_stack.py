@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from fake_worlds import fake_transitions
+from rapid.agents.saved import QAgent, save_agent
 from rapid.config import AdaptConfig, DistillConfig, LossConfig, NetworkConfig, OptimizerConfig
 from rapid.data.transitions import RANDOM, concatenate
 from rapid.errors import RapidError
-from rapid.networks.agent import QAgent, save_agent
 from rapid.networks.q_network import build_network, set_phase
 from rapid.networks.stack import stack_networks, unstack_networks
 from rapid.training import adapt, distill, offline
-from rapid.training.adam import clip_norm
 from rapid.training.learner import Learner
+from rapid.training.machinery.adam import clip_norm
 
 MLP = NetworkConfig(kind="mlp", hidden=(16, 8))
 DATA = concatenate([fake_transitions(10), fake_transitions(10, RANDOM, seed=1)])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rapid.config import preset
+from rapid.config_io import to_dict
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.evaluation.recording import Recording
@@ -19,7 +20,6 @@ from rapid.report import ReportData, RoutingSnapshot, text_summary, write_figure
 from rapid.report.curves import UNIFORM, charts, moving_picture, series
 from rapid.report.markup import script_json, tag, text
 from rapid.report.page import page
-from rapid.settings import to_dict
 
 SCENARIO = "lane-3-density-2"
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)> \u2028\u2029 & \"'`{{payload}} \ud800 <!--"

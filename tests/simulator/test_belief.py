@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from rapid.agents.open import PLANNERS, kind_of, open_agent
 from rapid.errors import RapidError
-from rapid.evaluation.agents import PLANNERS, kind_of, open_agent
 from rapid.evaluation.rollouts import run_episodes
 from rapid.scenarios import IDLE, LANE_RIGHT, NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES, SLOWER
 from rapid.simulator import belief, make_vec

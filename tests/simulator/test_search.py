@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
+from rapid.agents.open import driver_for, open_agent
 from rapid.errors import RapidError
-from rapid.evaluation.agents import driver_for, open_agent
 from rapid.scenarios import FASTER, IDLE, NUM_ACTIONS, SLOWER
 from rapid.simulator import make_env, make_vec
 from rapid.simulator.search import PlannerAgent, plan, unavoidable

@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 
-from rapid.training.adam import Adam, clip_norm, flush_denormals
+from rapid.training.machinery.adam import Adam, clip_norm, flush_denormals
 
 
 def weights() -> list[torch.Tensor]:

@@ -11,8 +11,8 @@ from rapid.data.transitions import RANDOM
 from rapid.errors import RapidError
 from rapid.training import adapt, online
 from rapid.training.learner import Learner
+from rapid.training.machinery.worlds import Explorer
 from rapid.training.online import exploration
-from rapid.training.worlds import Explorer
 
 SCENARIO = "lane-3-density-2"
 CONFIG = AdaptConfig(

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from rapid.agents.saved import load_agent, save_agent
 from rapid.config import Config, LossConfig, OptimizerConfig, preset
 from rapid.data.batch import with_rows
 from rapid.data.dataset import load_dataset, mix
 from rapid.data.replay import OfflineSampler
-from rapid.networks.agent import load_agent, save_agent
 from rapid.networks.q_network import build_network, set_phase, widened
 from rapid.training import offline
-from rapid.training.capture import WARM_UP
 from rapid.training.learner import Learner
+from rapid.training.machinery.capture import WARM_UP
 from rapid.training.online import adapt
 from rapid.training.ppo import adapt_by_ppo
 

@@ -9,17 +9,17 @@ from hypothesis import strategies as st
 from test_distill import DATA, Killed, lines, network, weights
 
 from fake_worlds import FakeWorlds
+from rapid.agents.saved import QAgent
 from rapid.config import AdaptConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
-from rapid.networks.agent import QAgent
 from rapid.networks.q_network import set_phase
 from rapid.scenarios import FASTER
 from rapid.simulator import make_vec
 from rapid.training import adapt_by_ppo, ppo
-from rapid.training.diagnostics import Forgetting
+from rapid.training.machinery.diagnostics import Forgetting
+from rapid.training.machinery.worlds import Drive
 from rapid.training.ppo import PpoLearner, advantages, without_clock
-from rapid.training.worlds import Drive
 
 SCENARIO = "lane-3-density-2"
 PPO = PpoConfig(steps=100, num_envs=3, rollout=8, epochs=2, batch_size=10, critic_steps=24)

@@ -7,7 +7,7 @@ import pytest
 from rapid import checkpoint
 from rapid.config import AdaptConfig
 from rapid.errors import RapidError
-from rapid.training.record import CHECKPOINT_FILE, Record
+from rapid.training.machinery.record import CHECKPOINT_FILE, Record
 
 CONFIG = AdaptConfig(steps=20)
 

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 import rapid
+from rapid.agents.open import check_road, driver_for, kind_of
 from rapid.errors import RapidError
-from rapid.evaluation.agents import check_road, driver_for, kind_of
 from rapid.evaluation.metrics import EpisodeRow, Kind
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.worlds import AttackLike, Perturbation, Worlds

@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 import rapid
+from rapid.agents.open import Driver, Said, driver_for
 from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
-from rapid.evaluation.agents import Driver, Said, driver_for
 from rapid.evaluation.metrics import SAME_LANE, VEHICLE_LENGTH, time_to_collision
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.worlds import Perturbation, Worlds
@@ -136,7 +136,7 @@ def drive_teacher(
     """Drive one episode for each spawn seed, `lockstep` of them side by side, and return what was measured.
 
     Args:
-        teacher: anything that can drive (:func:`rapid.evaluation.agents.driver_for`).
+        teacher: anything that can drive (:func:`rapid.agents.open.driver_for`).
         name: what to call it in the rows.
         scenario: where.
         seeds: the spawn seeds.

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rapid.agents.open import Driver
 from rapid.errors import RapidError
-from rapid.evaluation.agents import Driver
 from rapid.evaluation.metrics import time_to_collision
 from rapid.evaluation.recording import Recording
 from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS, NUM_VEHICLES

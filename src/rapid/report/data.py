@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.evaluation.recording import Recording
-from rapid.reproduce import PaperResult, paper_result
+from rapid.experiments.paper import PaperResult, paper_result
 from rapid.scenarios import Scenario
 
 Entries = Sequence[Mapping[str, Any]]
@@ -47,7 +47,7 @@ class ReportData:
     title: str
     """What to call the run."""
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """The resolved settings, as :func:`rapid.settings.to_dict` gives them."""
+    """The resolved settings, as :func:`rapid.config_io.to_dict` gives them."""
     versions: Mapping[str, str] = field(default_factory=dict[str, str])
     """Versions of what computed it."""
     commit: str = ""

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 from rapid.evaluation.statistics import Estimate
 from rapid.evaluation.summary import KINDS, NOT_APPLICABLE, NOT_RUN, AttackCell, SummaryRow, number, units
+from rapid.experiments.paper import PaperResult
 from rapid.report.data import paper_return
 from rapid.report.markup import Markup, tag, text
-from rapid.reproduce import PaperResult
 from rapid.scenarios import ACTIONS, Scenario, get_scenario
 
 ACTION_WORDS = tuple(name.replace("LANE_", "").lower() for name in ACTIONS)

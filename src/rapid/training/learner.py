@@ -11,8 +11,8 @@ from rapid.data.batch import TransitionBatch
 from rapid.errors import RapidError
 from rapid.losses import behavior_cloning_loss, q_loss
 from rapid.networks.q_network import QNetwork
-from rapid.training.adam import Adam, clip_norm
-from rapid.training.capture import CapturedStep
+from rapid.training.machinery.adam import Adam, clip_norm
+from rapid.training.machinery.capture import CapturedStep
 
 TERMS = ("td", "conservative", "robust", "total", "grad_norm")
 """What is recorded of every update; `grad_norm` is before clipping, and 0 where nothing is clipped. Of a stack, means

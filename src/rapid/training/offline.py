@@ -18,9 +18,9 @@ from rapid.networks.q_network import QNetwork, set_phase
 from rapid.networks.stack import unstack_networks
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, torch_stream
-from rapid.training.adam import flush_denormals
 from rapid.training.learner import Learner
-from rapid.training.record import Evaluate, Record, Track, crossed, fingerprint, network_fingerprint
+from rapid.training.machinery.adam import flush_denormals
+from rapid.training.machinery.record import Evaluate, Record, Track, crossed, fingerprint, network_fingerprint
 
 LOG_EVERY = 100
 

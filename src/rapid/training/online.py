@@ -17,12 +17,12 @@ from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
-from rapid.training.adam import flush_denormals
-from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import Learner
+from rapid.training.machinery.adam import flush_denormals
+from rapid.training.machinery.diagnostics import Forgetting, gate_size
+from rapid.training.machinery.record import Evaluate, Record, Track, crossed, network_fingerprint
+from rapid.training.machinery.worlds import Drive, Explorer, MakeWorlds, default_worlds
 from rapid.training.offline import check_labels, data_fingerprint
-from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
-from rapid.training.worlds import Drive, Explorer, MakeWorlds, default_worlds
 
 LOG_EVERY = 1_000
 """Environment steps between two lines of metrics."""

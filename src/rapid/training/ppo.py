@@ -17,18 +17,18 @@ import torch
 from torch import Tensor
 
 from rapid.config import AdaptConfig, NetworkConfig, PpoConfig
+from rapid.config_io import least_steps
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
-from rapid.settings import least_steps
-from rapid.training.adam import Adam, clip_norm, flush_denormals
-from rapid.training.diagnostics import Forgetting, gate_size
 from rapid.training.learner import check_generator
-from rapid.training.record import Evaluate, Record, Track, crossed, network_fingerprint
-from rapid.training.worlds import Drive, MakeWorlds, default_worlds
+from rapid.training.machinery.adam import Adam, clip_norm, flush_denormals
+from rapid.training.machinery.diagnostics import Forgetting, gate_size
+from rapid.training.machinery.record import Evaluate, Record, Track, crossed, network_fingerprint
+from rapid.training.machinery.worlds import Drive, MakeWorlds, default_worlds
 
 VALUE_SCALE = 10.0
 """By what the critic's output is multiplied: returns of 30 s reach some 30."""

@@ -3,7 +3,7 @@
 import itertools
 
 from rapid.config import preset
-from rapid.reproduce import paper_numbers, paper_result
+from rapid.experiments.paper import paper_numbers, paper_result
 from rapid.scenarios import PAPER_SCENARIOS, TARGET_SPEEDS, get_scenario
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid import checkpoint
+from rapid.config_io import apply_overrides, to_dict
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork
-from rapid.settings import apply_overrides, to_dict
 
 METRICS_FILE, CHECKPOINT_FILE = "metrics.jsonl", "checkpoint.safetensors"
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rapid import files
+from rapid.agents.onnx_graph import build_model
+from rapid.agents.saved import QAgent, check_observations
 from rapid.errors import RapidError
-from rapid.graph import build_model
-from rapid.networks.agent import QAgent, check_observations
 from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, MIN_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
 
 METADATA_KEY = "rapid"

@@ -7,9 +7,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from rapid.agents.saved import QAgent, load_agent, save_agent
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
-from rapid.networks.agent import QAgent, load_agent, save_agent
 from rapid.networks.q_network import build_network
 
 SMALL = {"width": 16, "heads": 2, "feedforward": 32, "hidden": (24,)}

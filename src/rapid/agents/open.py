@@ -57,7 +57,7 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
     if Path(spec).is_dir():
         return rapid.load_agent(spec, device)
     if Path(spec).suffix == ".onnx":
-        from rapid.export import OnnxAgent
+        from rapid.agents.onnx import OnnxAgent
 
         return OnnxAgent(spec)
     raise RapidError(

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from rapid.agents.onnx import OnnxAgent, export_onnx, latency
+from rapid.agents.saved import QAgent, save_agent
 from rapid.cli import main
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
-from rapid.export import OnnxAgent, export_onnx, latency
-from rapid.networks.agent import QAgent, save_agent
 from rapid.networks.q_network import build_network
 
 pytest.importorskip("onnxruntime")

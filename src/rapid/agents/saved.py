@@ -13,11 +13,11 @@ from torch import Tensor
 
 from rapid import files
 from rapid.config import NetworkConfig
+from rapid.config_io import apply_overrides
 from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
 from rapid.networks.q_network import Explanation, QNetwork, build_network
 from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
-from rapid.settings import apply_overrides
 
 FORMAT = "rapid-agent"
 VERSION = 1

@@ -1,0 +1,1 @@
+"""Agents: what drives, on disk, as ONNX, and how a name becomes one."""

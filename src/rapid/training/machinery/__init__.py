@@ -1,0 +1,1 @@
+"""What the trainers need beside their algorithms: worlds, records, optimisers, diagnostics."""
