@@ -18,7 +18,7 @@ def paper_numbers() -> dict[str, Any]:
     """Return the content of ``paper.toml``: tables `attack`, `offline`, `architecture` and `beta` with their `rows`,
     and `environment`, `hyperparameters` and `text`. Treat it as read-only.
     """
-    return tomllib.loads(resources.files(__package__).joinpath("paper.toml").read_text(encoding="utf-8"))
+    return tomllib.loads(resources.files("rapid.experiments").joinpath("paper.toml").read_text(encoding="utf-8"))
 
 
 def paper_result(table: str, column: str, **where: Any) -> PaperResult | None:
