@@ -100,7 +100,7 @@ def test_the_verb_exports_and_the_example_drives_without_torch(roads, tmp_path, 
     printed = capsys.readouterr().out
     for words in ("largest difference of Q-values", "the same action on 100.00%", "microseconds (median)"):
         assert words in printed
-    example = Path(__file__).parents[1] / "examples" / "drive_onnx.py"
+    example = Path(__file__).parents[2] / "examples" / "drive_onnx.py"
     assert len(example.read_text().splitlines()) <= 30
     command = [sys.executable, str(example), str(tmp_path / "pupil.onnx"), "1"]
     told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
