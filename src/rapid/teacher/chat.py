@@ -38,6 +38,10 @@ class Reply:
     retries: int = 0
     tokens: tuple[Token, ...] = ()
     """The tokens of `text` with their probabilities, where they were asked for and given."""
+    reasoning: str = ""
+    """What the model thought aloud, where the server tells it apart from `text`; never part of the answer."""
+    finish_reason: str = ""
+    """Why the answer ended, in the server's word: `stop`, `length` if it was cut off, or another."""
 
 
 @dataclass(frozen=True)
