@@ -189,7 +189,7 @@
       element("div", { class: "controls" }, play, back, on, pace),
       element("div", { class: "readout" }, element("div", {}, element("h4", {}, "now"), facts), element("div", {}, valuesHead, values), element("div", {}, saidHead, said)),
     );
-    let episode = null, time = 0, running = false, clock = 0, step = -1, cells = [];
+    let episode = null, time = 0, running = false, clock = null, request = 0, step = -1, cells = [];
 
     function load(index) {
       episode = data.episodes[index];
@@ -211,21 +211,21 @@
     function setRunning(state) {
       running = state;
       play.textContent = running ? "Pause" : "Play";
+      // One frame is asked for at a time: a second chain of them would run the clock at double speed.
+      cancelAnimationFrame(request);
       if (!running) return;
-      if (time >= episode.actions.length) time = 0;
-      clock = performance.now();
-      requestAnimationFrame(tick);
+      if (time >= episode.actions.length) seek(0);
+      clock = null;
+      request = requestAnimationFrame(tick);
     }
     function tick(now) {
-      if (!running) return;
-      time += ((now - clock) / 1000) * Number(pace.value);
+      // A frame's time may lie before the click that asked for it, so the clock starts with the first frame. A tab that
+      // was hidden gets its next frame after minutes: no frame counts for more than a tenth of a second.
+      const passed = clock === null ? 0 : Math.min(Math.max(now - clock, 0), 100) / 1000;
       clock = now;
-      if (time >= episode.actions.length) {
-        time = episode.actions.length;
-        setRunning(false);
-      }
-      render();
-      requestAnimationFrame(tick);
+      seek(time + passed * Number(pace.value));
+      if (time >= episode.actions.length) return setRunning(false);
+      request = requestAnimationFrame(tick);
     }
 
     // Between two observations, a second apart, a vehicle follows the cubic that keeps its place and velocity at both.

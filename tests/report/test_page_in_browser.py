@@ -1,0 +1,258 @@
+"""The page in a real browser: what a reader can do with it, and what it must never do."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import HOSTILE, full, recording
+
+from browser import Tab, tab, until
+from rapid.evaluation.recording import Recording
+from rapid.report import ReportData, write_report
+
+Open = Callable[..., Tab]
+
+
+def ride(length: int, agent: str = "teacher") -> Recording:
+    """An episode of so many decisions on a road with two cars."""
+    one = recording()
+    obs = np.zeros((length + 1, 15, 5), np.float32)
+    obs[:, 0] = [(1, 100 + 20 * t, 4, 20, 0) for t in range(length + 1)]
+    obs[:, 1] = [(1, 130 + 15 * t, 0, 15, 0) for t in range(length + 1)]
+    return replace(
+        one,
+        agent=agent,
+        obs_TVF=obs,
+        action_T=np.arange(length) % 5,
+        reward_T=np.full(length, 0.5),
+        q_TA=np.tile(np.arange(5, dtype=np.float32), (length, 1)),
+        explanations=tuple(f"words {t}" for t in range(length)),
+        crashed=False,
+    )
+
+
+def run(*recordings: Recording) -> ReportData:
+    return replace(full(), recordings=list(recordings) or [ride(3), ride(5, "other")])
+
+
+@pytest.fixture
+def opened(chromium: Any, tmp_path: Path) -> Iterator[Open]:
+    """Open the page of a run; at the end nothing may have gone wrong in it, and nobody may have been asked."""
+    with ExitStack() as stack:
+        tabs: list[tuple[Tab, str]] = []
+
+        def show(data: ReportData, **emulated: Any) -> Tab:
+            url = write_report(data, tmp_path).as_uri()
+            shown = stack.enter_context(tab(chromium, **emulated))
+            shown.page.goto(url)
+            tabs.append((shown, url))
+            return shown
+
+        yield show
+        for shown, url in tabs:
+            assert shown.troubles == []
+            assert shown.elsewhere(url) == []
+
+
+def clock(page: Any) -> float:
+    return float(page.get_by_label("time, seconds").input_value())
+
+
+def button(page: Any, name: str) -> Any:
+    return page.get_by_role("button", name=name, exact=True)
+
+
+def watch_clock(page: Any) -> None:
+    """Keep every time that the player shows from now on."""
+    page.evaluate(
+        """() => {
+          const scrub = document.querySelector(".player input[type=range]");
+          window.shown = [];
+          const own = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value");
+          Object.defineProperty(scrub, "value", {
+            get() { return own.get.call(this); },
+            set(value) { window.shown.push(Number(value)); own.set.call(this, value); },
+          });
+        }"""
+    )
+
+
+def test_a_click_plays_to_the_end_every_time_and_the_clock_stays_inside(opened: Open) -> None:
+    page = opened(run()).page
+    watch_clock(page)
+    page.get_by_label("pace", exact=True).select_option("4")
+    for _ in range(4):
+        button(page, "Play").click()
+        button(page, "Pause").wait_for()
+        button(page, "Play").wait_for(timeout=5000)
+        assert clock(page) == 3
+    shown = page.evaluate("window.shown")
+    assert len(shown) > 20
+    assert min(shown) >= 0
+    assert max(shown) <= 3
+
+
+def test_a_frame_whose_time_lies_before_the_click_or_far_after_it_does_no_harm(opened: Open) -> None:
+    # Browsers give a frame the time at which it was due, which may be before the click that asked for it; and a tab
+    # that was hidden gets its next frame after minutes.
+    page = opened(run(ride(30))).page
+    page.evaluate(
+        """() => {
+          const real = window.requestAnimationFrame.bind(window);
+          const late = [-5000, -5000, 0, 600000, 600016];
+          window.requestAnimationFrame = (call) => real((now) => call(now + (late.length ? late.shift() : 600032)));
+        }"""
+    )
+    watch_clock(page)
+    button(page, "Play").click()
+    until(page, "window.shown.length > 12")
+    button(page, "Pause").click()
+    shown = page.evaluate("window.shown")
+    assert shown == sorted(shown)
+    assert 0 <= min(shown) <= max(shown) < 10
+
+
+def test_clicking_play_many_times_leaves_one_clock(opened: Open) -> None:
+    page = opened(run(ride(30))).page
+    asked = page.evaluate(
+        """async () => {
+          let asked = 0;
+          const real = window.requestAnimationFrame.bind(window);
+          window.requestAnimationFrame = (call) => real((now) => { asked++; call(now); });
+          const play = document.querySelector(".player .play");
+          for (let i = 0; i < 7; i++) play.click();
+          const frames = await new Promise((done) => {
+            let seen = 0;
+            const count = () => (++seen < 20 ? real(count) : done(seen));
+            real(count);
+          });
+          play.click();
+          return asked / frames;
+        }"""
+    )
+    assert 0.5 < asked < 1.3
+
+
+def test_scrubbing_shows_the_decision_under_it(opened: Open) -> None:
+    page = opened(run(ride(5))).page
+    page.get_by_label("time, seconds").fill("3.5")
+    assert "words 3" in page.locator(".said").inner_text()
+    assert "3.5 s" in page.locator(".readout").inner_text()
+    page.get_by_label("time, seconds").fill("0")
+    assert "words 0" in page.locator(".said").inner_text()
+    page.get_by_title("decision 5: slower").click()
+    assert clock(page) == 4
+
+
+def test_the_episode_can_be_changed_while_it_plays(opened: Open) -> None:
+    page = opened(run(ride(30), ride(2, "other"))).page
+    page.get_by_label("time, seconds").fill("20")
+    button(page, "Play").click()
+    page.get_by_label("episode", exact=True).select_option("1")
+    button(page, "Play").wait_for()
+    assert clock(page) == 0
+    assert page.locator(".strip button").count() == 2
+    page.get_by_label("pace", exact=True).select_option("4")
+    button(page, "Play").click()
+    until(page, "document.querySelector('.scrub').value === '2'")
+
+
+def test_keys(opened: Open) -> None:
+    page = opened(run(ride(5))).page
+    page.locator(".player").first.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert clock(page) == 2
+    page.keyboard.press("ArrowLeft")
+    assert clock(page) == 1
+    for _ in range(9):
+        page.keyboard.press("ArrowLeft")
+    assert clock(page) == 0
+    page.keyboard.press("Space")
+    button(page, "Pause").wait_for()
+    page.keyboard.press("Space")
+    button(page, "Play").wait_for()
+    for _ in range(9):
+        page.keyboard.press("ArrowRight")
+    assert clock(page) == 5
+
+
+def test_tables_are_sorted_by_their_values(opened: Open) -> None:
+    page = opened(run()).page
+    head = page.locator("table.sortable").first.locator("thead th", has=page.locator("button")).nth(1)
+
+    def column() -> list[float]:
+        return page.evaluate(
+            """() => {
+              const table = document.querySelector("table.sortable");
+              const heads = [...table.tHead.rows[0].cells];
+              const at = heads.findIndex((head) => head.hasAttribute("aria-sort"));
+              return [...table.tBodies[0].rows].map((row) => row.cells[at].dataset.value).filter(Boolean).map(Number);
+            }"""
+        )
+
+    head.get_by_role("button").click()
+    falling = column()
+    assert head.get_attribute("aria-sort") == "descending"
+    assert len(falling) >= 2
+    assert falling == sorted(falling, reverse=True)
+    head.get_by_role("button").click()
+    assert head.get_attribute("aria-sort") == "ascending"
+    assert column() == sorted(falling)
+
+
+@pytest.mark.parametrize("width", [320, 390])
+def test_a_narrow_screen_needs_no_scrolling_sideways(opened: Open, width: int) -> None:
+    page = opened(run(), viewport={"width": width, "height": 800}, has_touch=True, is_mobile=True).page
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    button(page, "Play").tap()
+    button(page, "Pause").wait_for()
+
+
+def test_dark_is_dark(opened: Open) -> None:
+    def brightness(scheme: str) -> tuple[float, float]:
+        page = opened(run(), color_scheme=scheme).page
+        return tuple(
+            page.evaluate(
+                """(part) => getComputedStyle(document.body)[part].match(/[\\d.]+/g).slice(0, 3)
+                  .reduce((sum, value) => sum + Number(value), 0) / 765""",
+                part,
+            )
+            for part in ("backgroundColor", "color")
+        )
+
+    paper, ink = brightness("light")
+    assert paper > 0.9 > 0.3 > ink
+    paper, ink = brightness("dark")
+    assert paper < 0.2 < 0.8 < ink
+
+
+def test_hostile_text_stays_text(opened: Open) -> None:
+    shown = opened(replace(full(HOSTILE), recordings=[recording(HOSTILE)]))
+    page = shown.page
+    assert page.locator("img").count() == 0
+    assert page.locator("script").count() == 2
+    assert "<script>alert(1)</script>" in page.locator(".said").inner_text()
+
+
+def test_an_injected_script_does_not_run(chromium: Any, tmp_path: Path) -> None:
+    # As if something had found its way past all escaping: the browser itself refuses to run it.
+    path = write_report(run(), tmp_path)
+    content = path.read_text(encoding="utf-8")
+    evil = "<script>window.caught = 1</script><img src=x onerror='window.caught = 2'>"
+    path.write_text(content.replace("<main>", f"<main>{evil}"), encoding="utf-8")
+    with tab(chromium) as shown:
+        shown.page.goto(path.as_uri())
+        button(shown.page, "Play").wait_for()
+        assert shown.page.evaluate("window.caught") is None
+        assert any("Content Security Policy" in trouble for trouble in shown.troubles)
+
+
+def test_a_page_without_episodes_has_no_player(opened: Open) -> None:
+    page = opened(replace(full(), recordings=[])).page
+    assert page.locator(".player").count() == 0
+    assert "No episode was recorded." in page.locator("#watch").inner_text()
