@@ -44,7 +44,8 @@ from rapid.files import cache_dir, write_json, write_text
 from rapid.losses import q_loss
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.networks.stack import stack_networks
-from rapid.pipeline import baseline, collect_transitions
+from rapid.phases.data import collect_transitions
+from rapid.phases.distill import baseline
 from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import get_scenario

@@ -29,7 +29,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from rapid import pipeline
 from rapid.agents.open import open_agent
 from rapid.agents.saved import load_agent
 from rapid.config import AdaptConfig, Config, PpoConfig, TeacherConfig, preset
@@ -44,6 +43,11 @@ from rapid.evaluation.statistics import Estimate, paired_difference
 from rapid.evaluation.summary import summary_text
 from rapid.files import write_text
 from rapid.networks.q_network import check_widening
+from rapid.phases.adapt import adapt_agent
+from rapid.phases.checks import check
+from rapid.phases.data import collect_transitions, mix_datasets
+from rapid.phases.distill import baseline, distill_agent
+from rapid.phases.measure import TEACHER
 from rapid.progress import task
 from rapid.report.data import paper_return
 from rapid.runs import commit
@@ -89,10 +93,10 @@ def offline_recipes(config: Config) -> dict[str, Distillation]:
     """Return how every agent is trained offline, by name."""
     return {
         "distilled": Distillation(config),
-        "offline DQN": Distillation(pipeline.baseline(config, "dqn")),
-        "offline DDQN": Distillation(pipeline.baseline(config, "ddqn")),
-        "CQL": Distillation(pipeline.baseline(config, "cql")),
-        "behaviour cloning": Distillation(pipeline.baseline(config, "bc")),
+        "offline DQN": Distillation(baseline(config, "dqn")),
+        "offline DDQN": Distillation(baseline(config, "ddqn")),
+        "CQL": Distillation(baseline(config, "cql")),
+        "behaviour cloning": Distillation(baseline(config, "bc")),
     }
 
 
@@ -122,7 +126,7 @@ def offline_with_more_data(config: Config) -> dict[str, Distillation]:
     return {
         f"distilled, {of}": Distillation(more, "collected"),
         more_distilled(): Distillation(without(more, robust_weight=0.0), "collected"),
-        f"CQL, {of}": Distillation(pipeline.baseline(more, "cql"), "collected"),
+        f"CQL, {of}": Distillation(baseline(more, "cql"), "collected"),
     }
 
 
@@ -170,7 +174,7 @@ def online_recipes(
         same = replace(from_scratch, loss=replace(adapt.loss, discount=discount))
         found[f"online Munchausen DQN, {short(steps)}"] = Adaptation(same, "offline DDQN")
     if config.recipe == "paper":
-        rate = pipeline.baseline(config, "dqn").distill.optimizer.learning_rate
+        rate = baseline(config, "dqn").distill.optimizer.learning_rate
         plain = replace(from_scratch.loss, double=False)
         dqn = replace(from_scratch, loss=plain, optimizer=replace(from_scratch.optimizer, learning_rate=rate))
         found[f"online DQN, {short(steps)}"] = Adaptation(dqn, "offline DQN")
@@ -291,7 +295,7 @@ def train(
     for name, (settings, source) in offline.items():
         home = work / file_name(name)
         if name in needed and not is_trained(home, settings, "distill"):
-            pipeline.distill_agent(settings, mixed(settings, data, work, source), home, name)
+            distill_agent(settings, mixed(settings, data, work, source), home, name)
         if name in wanted:
             agents.append((name, home / "agent"))
     bases = dict.fromkeys(offline, config)
@@ -300,7 +304,7 @@ def train(
         home, own = work / scenario / file_name(name), replace(bases[name], adapt=settings)
         if name in needed and not is_trained(home, own, "adapt"):
             start = (work / scenario if origin in online else work) / file_name(origin) / "agent"
-            pipeline.adapt_agent(own, start, mixed(own, data, work, source) if source else None, home, name)
+            adapt_agent(own, start, mixed(own, data, work, source) if source else None, home, name)
         if name in wanted:
             agents.append((name, home / "agent"))
     return agents
@@ -363,7 +367,7 @@ def mixed(config: Config, scenario: str, work: Path, source: Source = "teacher")
     mixture = work / ("mix" if source == "teacher" else f"mix-{source}")
     if not (mixture / "dataset.json").exists():
         work.mkdir(parents=True, exist_ok=True)
-        pipeline.mix_datasets(config, *datasets(config, scenario, work.parent, source), mixture)
+        mix_datasets(config, *datasets(config, scenario, work.parent, source), mixture)
     return mixture
 
 
@@ -377,7 +381,7 @@ def datasets(config: Config, scenario: str, work: Path, source: Source) -> tuple
             folder = work / "collected" / driver
             # Once it is there, calls for several seeds may read it side by side.
             if not (folder / "dataset.json").exists() or len(load_dataset(folder)) < MORE_DATA:
-                pipeline.collect_transitions(replace(config, scenario=driven), folder, driver)
+                collect_transitions(replace(config, scenario=driven), folder, driver)
         else:
             folder = dataset_folder(f"shipped:{driven}/{source if driver == 'teacher' else driver}")
         if driven != scenario:
@@ -446,7 +450,7 @@ def measure_references(
             path = reference_rows(work, scenario, spawns, name)
             if path.exists() or floor_rows(floors, scenario, spawns, name):
                 continue
-            if name == pipeline.TEACHER:
+            if name == TEACHER:
                 driver = make_teacher(TeacherConfig(), get_scenario(scenario).lanes, 0)
             else:
                 driver = open_agent(name, scenario)
@@ -607,7 +611,7 @@ def table(work: Path, scenarios: list[str], data: str, spawns: int, config: Conf
     for scenario in scenarios:
         pattern = f"{data or scenario}/seed-*/rows/{scenario}-{spawns}-*.parquet"
         driven = {name: floor_rows(floors, scenario, spawns, name) for name in FLOORS}
-        missing = [name for name in (*FLOORS, pipeline.TEACHER) if not driven.get(name)]
+        missing = [name for name in (*FLOORS, TEACHER) if not driven.get(name)]
         paths = [*(reference_rows(work, scenario, spawns, name) for name in missing), *sorted(work.glob(pattern))]
         here = [row for path in paths if path.exists() for row in load_rows(path)]
         own += here
@@ -687,13 +691,13 @@ def main() -> None:
     config = replace(config, device=chosen.device, evaluate=replace(config.evaluate, curve_spawns=0))
     work = chosen.work / chosen.recipe
     if not chosen.table:
-        pipeline.check(config)
+        check(config)
         if chosen.ppo or chosen.vehicles:
             ppo = replace(config.adapt.ppo, steps=chosen.ppo)
-            pipeline.check(replace(config, adapt=replace(config.adapt, ppo=ppo, vehicles=chosen.vehicles)))
+            check(replace(config, adapt=replace(config.adapt, ppo=ppo, vehicles=chosen.vehicles)))
         if chosen.vehicles:
             check_widening(config.network, chosen.vehicles)
-        references = [*chosen.floors, *([pipeline.TEACHER] if chosen.teacher else [])]
+        references = [*chosen.floors, *([TEACHER] if chosen.teacher else [])]
         measure_references(work, load_rows(chosen.out / "floors.parquet"), references, chosen.scenarios, chosen.spawns)
         for seed in chosen.seeds:
             for scenario in chosen.scenarios:

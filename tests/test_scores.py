@@ -75,11 +75,11 @@ def test_a_setting_that_did_not_exist_yet_had_its_default(benchmark, config, tmp
 def asked(benchmark, tmp_path, monkeypatch):
     """The trainings asked for online, instead of their being done: settings, where it starts, data, by name."""
     asked: dict[str, tuple] = {}
-    monkeypatch.setattr(benchmark.pipeline, "mix_datasets", lambda *_: None)
+    monkeypatch.setattr(benchmark, "mix_datasets", lambda *_: None)
     monkeypatch.setattr(benchmark, "datasets", lambda *_: (tmp_path, tmp_path))
-    monkeypatch.setattr(benchmark.pipeline, "distill_agent", lambda *_: None)
+    monkeypatch.setattr(benchmark, "distill_agent", lambda *_: None)
     monkeypatch.setattr(
-        benchmark.pipeline,
+        benchmark,
         "adapt_agent",
         lambda config, agent, data, out, name: asked.update({name: (config.adapt, agent, data)}),
     )
@@ -108,7 +108,7 @@ def test_methods_of_one_budget_have_the_same_steps_and_updates(benchmark, config
 
 def test_only_what_is_wanted_and_what_it_starts_from_is_trained(benchmark, config, tmp_path, asked, monkeypatch):
     distilled = []
-    monkeypatch.setattr(benchmark.pipeline, "distill_agent", lambda *words: distilled.append(words[-1]))
+    monkeypatch.setattr(benchmark, "distill_agent", lambda *words: distilled.append(words[-1]))
     work = (tmp_path, "lane-3-density-2", (10_000, 100_000))
     agents = benchmark.train(config, "lane-3-density-2", *work, only=["online DDQN, 10K", "distilled"])
     assert [name for name, _ in agents] == ["distilled", "online DDQN, 10K"]
@@ -202,8 +202,8 @@ def test_who_begins_from_more_data_is_careful_for_longer(benchmark, config, tmp_
 def test_the_rules_data_takes_the_teachers_place(benchmark, config, tmp_path, asked, monkeypatch):
     mixed, learned = [], {}
     monkeypatch.setattr(benchmark, "datasets", lambda config, data, work, source: (work / source, work / "random"))
-    monkeypatch.setattr(benchmark.pipeline, "mix_datasets", lambda _, driver, random, out: mixed.append(driver.name))
-    monkeypatch.setattr(benchmark.pipeline, "distill_agent", lambda _, data, out, name: learned.update({name: data}))
+    monkeypatch.setattr(benchmark, "mix_datasets", lambda _, driver, random, out: mixed.append(driver.name))
+    monkeypatch.setattr(benchmark, "distill_agent", lambda _, data, out, name: learned.update({name: data}))
     names = ["distilled", benchmark.RULE_DATA]
     work = tmp_path / "work"
     benchmark.train(config, "lane-3-density-2", work, "lane-3-density-2", (), ablations=True, only=names)
@@ -216,15 +216,13 @@ def test_the_rules_data_takes_the_teachers_place(benchmark, config, tmp_path, as
 def test_more_data_is_collected_first_and_learned_from_by_rapid_and_cql(benchmark, config, tmp_path, monkeypatch):
     collected, mixed, learned = [], [], {}
     monkeypatch.setattr(
-        benchmark.pipeline,
+        benchmark,
         "collect_transitions",
         lambda config, out, driver: collected.append((driver, out, config.collect, config.scenario)),
     )
+    monkeypatch.setattr(benchmark, "mix_datasets", lambda config, *folders: mixed.append((config.mix.size, *folders)))
     monkeypatch.setattr(
-        benchmark.pipeline, "mix_datasets", lambda config, *folders: mixed.append((config.mix.size, *folders))
-    )
-    monkeypatch.setattr(
-        benchmark.pipeline,
+        benchmark,
         "distill_agent",
         lambda config, data, out, name: learned.update({name: (config.distill, data)}),
     )

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from rapid import pipeline
 from rapid.config import Config, TeacherConfig, preset
 from rapid.config_io import apply_overrides
 from rapid.data.card import card
@@ -17,6 +16,9 @@ from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.teachers import drive_teacher
 from rapid.files import read_json
+from rapid.phases.measure import why_no_teacher
+from rapid.phases.page import report_again
+from rapid.run import run
 from rapid.scenarios import PAPER_SCENARIOS
 from rapid.teacher import make_teacher
 from rapid.verbs import call
@@ -90,7 +92,7 @@ def test_the_documentation_shows_their_cards():
 
 def test_a_run_on_shipped_data_goes_from_the_mixture_to_the_page_without_a_model(config: Config, tmp_path: Path):
     said: list[str] = []
-    page = pipeline.run(config, tmp_path / "run", say=said.append).read_text()
+    page = run(config, tmp_path / "run", say=said.append).read_text()
     assert not (tmp_path / "run" / "collect").exists()
     assert not (tmp_path / "cache" / "models").exists()
     assert load_dataset(tmp_path / "run" / "mix").drivers["teacher"]["name"] == "smollm2-135m"
@@ -100,7 +102,7 @@ def test_a_run_on_shipped_data_goes_from_the_mixture_to_the_page_without_a_model
     assert any("rapid models pull smollm2-135m" in line for line in said)
     assert "its data: shipped" in page
     assert "rapid models pull smollm2-135m" in page
-    assert "rapid models pull" in pipeline.report_again(tmp_path / "run").read_text()
+    assert "rapid models pull" in report_again(tmp_path / "run").read_text()
 
 
 def test_a_folder_with_both_sets_serves_too_and_its_driver_is_measured(
@@ -110,8 +112,8 @@ def test_a_folder_with_both_sets_serves_too_and_its_driver_is_measured(
     shutil.copytree(dataset_folder("shipped:lane-3-density-2/random"), tmp_path / "mine" / "random")
     monkeypatch.chdir(tmp_path)
     driver = {"teacher": {"backend": "scripted", "model": "rule-forecast"}}
-    monkeypatch.setattr(pipeline, "_report", lambda config, home: {})
-    pipeline.run(apply_overrides(config, {"data": "mine", **driver}), tmp_path / "run", say=lambda line: None)
+    monkeypatch.setattr("rapid.run._report", lambda config, home: {})
+    run(apply_overrides(config, {"data": "mine", **driver}), tmp_path / "run", say=lambda line: None)
     assert "rule-forecast" in {row.agent for row in load_rows(tmp_path / "run/evaluate/episodes.parquet")}
     # Kept whole, so that the page can be written again from anywhere.
     assert read_json(tmp_path / "run" / "run.json")["config"]["data"] == str(tmp_path / "mine")
@@ -119,7 +121,7 @@ def test_a_folder_with_both_sets_serves_too_and_its_driver_is_measured(
 
 def test_a_driver_other_than_the_datas_is_not_measured_as_the_teacher(config: Config):
     other = {"teacher": {"backend": "scripted", "model": "rule-forecast"}}
-    assert "smollm2-135m drove in the data" in pipeline._why_no_teacher(apply_overrides(config, other))
+    assert "smollm2-135m drove in the data" in why_no_teacher(apply_overrides(config, other))
 
 
 @pytest.mark.parametrize(
@@ -135,14 +137,14 @@ def test_data_that_cannot_serve_is_refused_before_any_work(
     config: Config, tmp_path: Path, overrides: dict[str, object], says: str
 ):
     with pytest.raises(RapidError, match=says):
-        pipeline.run(apply_overrides(config, overrides), tmp_path / "run", say=lambda line: None)
+        run(apply_overrides(config, overrides), tmp_path / "run", say=lambda line: None)
     assert not (tmp_path / "run").exists()
 
 
 def test_data_of_another_scenario_is_refused(config: Config, tmp_path: Path):
     given = {"data": str(dataset_folder("shipped:lane-3-density-2/teacher").parent), "scenario": "lane-4-density-2.5"}
     with pytest.raises(RapidError, match="is of the scenario 'lane-3-density-2', not"):
-        pipeline.run(apply_overrides(config, given), tmp_path / "run", say=lambda line: None)
+        run(apply_overrides(config, given), tmp_path / "run", say=lambda line: None)
 
 
 def test_a_shipped_set_stands_where_a_path_is_expected(tmp_path: Path):

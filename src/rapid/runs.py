@@ -24,6 +24,8 @@ from rapid.errors import RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
 
 FORMAT = 1
+STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
+"""The steps of a run, in their order."""
 _PACKAGES = (
     "torch",
     "numpy",

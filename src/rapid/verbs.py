@@ -342,7 +342,7 @@ def _with_options(base: Config, options: Any) -> Config:
 
 
 def _run(options: Run, config: Config) -> int:
-    from rapid import pipeline
+    from rapid.run import run
 
     name = f"{config.scenario}-{config.recipe}-{config.scale}-seed{config.seed}".replace(":", "-")
     plain = dataclasses.replace(preset(config.recipe, config.scale), scenario=config.scenario, seed=config.seed)
@@ -350,17 +350,18 @@ def _run(options: Run, config: Config) -> int:
         # Any other setting gets a directory of its own, so that it does not meet the run without it.
         differing = json.dumps(to_dict(without_place(config)), sort_keys=True)
         name += f"-{hashlib.sha256(differing.encode()).hexdigest()[:8]}"
-    pipeline.run(config, Path(options.directory or f"runs/{name}"), options.restart)
+    run(config, Path(options.directory or f"runs/{name}"), options.restart)
     return 0
 
 
 def _collect(options: Collect, config: Config) -> int:
-    from rapid import pipeline
+    from rapid.phases.checks import check
+    from rapid.phases.data import collect_transitions
 
-    pipeline.check(config)
+    check(config)
     # The random driver's transitions are the other source of a mixture, from spawns of their own.
     uniform = (config.teacher.backend, config.teacher.model) == ("scripted", "random")
-    dataset = pipeline.collect_transitions(config, Path(options.out), "random" if uniform else "teacher")
+    dataset = collect_transitions(config, Path(options.out), "random" if uniform else "teacher")
     print(f"{len(dataset)} transitions in {options.out}")
     if not (dataset.collection or {}).get("complete", True):
         print("The budget is spent; the same command with a larger one goes on.", file=sys.stderr)
@@ -385,10 +386,10 @@ def _relabel(options: Relabel, config: Config) -> int:
 
 
 def _mix(options: Mix, config: Config) -> int:
-    from rapid import pipeline
+    from rapid.phases.data import mix_datasets
 
     out = _new_folder(options.out)
-    mixed = pipeline.mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
+    mixed = mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
     print(f"{len(mixed)} transitions in {options.out}")
     return 0
 
@@ -408,35 +409,37 @@ def _new_folder(path: str) -> Path:
 
 
 def _distill(options: Distill, config: Config) -> int:
-    from rapid import pipeline
+    from rapid.phases.checks import check
+    from rapid.phases.distill import distill_agent, distill_seeds
 
-    pipeline.check(config)
+    check(config)
     if options.seeds < 1:
         raise RapidError(f"At least one agent must be trained; got --seeds {options.seeds}. Give 1 or more.")
     if options.seeds == 1:
-        pipeline.distill_agent(config, Path(options.dataset), Path(options.out))
+        distill_agent(config, Path(options.dataset), Path(options.out))
         print(f"The agent is in {options.out}/agent")
         return 0
     seeds = range(config.seed, config.seed + options.seeds)
-    for home in pipeline.distill_seeds(config, Path(options.dataset), Path(options.out), seeds):
+    for home in distill_seeds(config, Path(options.dataset), Path(options.out), seeds):
         print(f"An agent is in {home}/agent")
     return 0
 
 
 def _adapt(options: Adapt, config: Config) -> int:
-    from rapid import pipeline
+    from rapid.phases.adapt import adapt_agent
+    from rapid.phases.checks import check
 
-    pipeline.check(config)
+    check(config)
     dataset = Path(options.dataset) if options.dataset else None
-    pipeline.adapt_agent(config, Path(options.agent), dataset, Path(options.out))
+    adapt_agent(config, Path(options.agent), dataset, Path(options.out))
     print(f"The agent is in {options.out}/agent")
     return 0
 
 
 def _evaluate(options: Evaluate, config: Config) -> int:
-    from rapid import pipeline
+    from rapid.phases.measure import compare
 
-    pipeline.compare(config, options.agents, Path(options.out))
+    compare(config, options.agents, Path(options.out))
     print((Path(options.out) / "summary.txt").read_text(encoding="utf-8"))
     return 0
 
@@ -484,9 +487,9 @@ def _export(options: Export, config: Config) -> int:
 
 
 def _report(options: Report, config: Config) -> int:
-    from rapid import pipeline
+    from rapid.phases.page import report_again
 
-    print(pipeline.report_again(Path(options.directory)))
+    print(report_again(Path(options.directory)))
     return 0
 
 

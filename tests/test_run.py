@@ -16,7 +16,6 @@ import pytest
 import torch
 
 import rapid
-from rapid import pipeline
 from rapid.agents.saved import QAgent
 from rapid.config import Config, PpoConfig, preset
 from rapid.config_io import apply_overrides
@@ -25,6 +24,12 @@ from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.q_network import build_network
+from rapid.phases.adapt import adapt_agent
+from rapid.phases.distill import baseline, distill_agent, distill_seeds
+from rapid.phases.measure import compare
+from rapid.phases.page import report_again
+from rapid.run import run
+from rapid.runs import STEPS
 from rapid.scenarios import SLOWER
 from rapid.training.machinery.diagnostics import FORGETTING_STATES
 from rapid.training.machinery.record import load_metrics
@@ -53,7 +58,7 @@ def config() -> Config:
 @pytest.fixture(scope="module")
 def finished(config: Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("run") / "run"
-    pipeline.run(config, directory, say=lambda line: None)
+    run(config, directory, say=lambda line: None)
     return directory
 
 
@@ -83,24 +88,24 @@ def test_a_run_leaves_agents_rows_and_a_page(finished: Path):
 def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, kind):
     config = preset("strong", "tiny")
     if kind == "mlp":
-        config = pipeline.baseline(config, "cql")
+        config = baseline(config, "cql")
     small = replace(config.distill, iterations=4, evaluate_every=2)
     config = replace(config, distill=small, evaluate=replace(config.evaluate, curve_spawns=1))
-    homes = pipeline.distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2))
+    homes = distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2))
     assert [home.name for home in homes] == ["seed-1", "seed-2"]
     assert (tmp_path / "all" / "together" / "metrics.jsonl").exists() == (kind == "mlp")
     for seed, home in zip((1, 2), homes, strict=True):
-        alone = pipeline.distill_agent(replace(config, seed=seed), finished / "mix", tmp_path / f"{seed}")
+        alone = distill_agent(replace(config, seed=seed), finished / "mix", tmp_path / f"{seed}")
         agent = rapid.load_agent(home / "agent")
         assert agent.metadata["seed"] == seed
         for name, weight in alone.network.state_dict().items():
             torch.testing.assert_close(agent.network.state_dict()[name], weight, rtol=1e-3, atol=1e-5)
     # The same command does nothing again; other ways of training do not write over it.
     before = [(home / "agent" / "weights.safetensors").read_bytes() for home in homes]
-    assert pipeline.distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2)) == homes
-    other = preset("strong", "tiny") if kind == "mlp" else pipeline.baseline(preset("strong", "tiny"), "cql")
+    assert distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2)) == homes
+    other = preset("strong", "tiny") if kind == "mlp" else baseline(preset("strong", "tiny"), "cql")
     with pytest.raises(RapidError, match="Choose another --out"):
-        pipeline.distill_seeds(other, finished / "mix", tmp_path / "all", (1, 2))
+        distill_seeds(other, finished / "mix", tmp_path / "all", (1, 2))
     assert [(home / "agent" / "weights.safetensors").read_bytes() for home in homes] == before
 
 
@@ -116,24 +121,24 @@ def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(fin
 def test_the_same_command_again_does_nothing(config: Config, finished: Path):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.name != "lock"}
     said: list[str] = []
-    pipeline.run(config, finished, say=said.append)
+    run(config, finished, say=said.append)
     assert before == {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.name != "lock"}
-    assert sum("done before" in line for line in said) == len(pipeline.STEPS)
+    assert sum("done before" in line for line in said) == len(STEPS)
 
 
 def test_steps_of_another_commit_are_named(config: Config, finished: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pipeline, "commit", lambda: "another")
+    monkeypatch.setattr("rapid.run.commit", lambda: "another")
     said: list[str] = []
-    pipeline.run(config, finished, say=said.append)
+    run(config, finished, say=said.append)
     (line,) = (line for line in said if "another commit" in line)
-    assert all(step in line for step in pipeline.STEPS)
+    assert all(step in line for step in STEPS)
 
 
 def test_other_settings_and_unknown_steps_are_refused(config: Config, finished: Path):
     with pytest.raises(RapidError, match="other settings"):
-        pipeline.run(apply_overrides(config, {"seed": 1}), finished, say=lambda line: None)
+        run(apply_overrides(config, {"seed": 1}), finished, say=lambda line: None)
     with pytest.raises(RapidError, match="did you mean 'mix'"):
-        pipeline.run(config, finished, "mxi", say=lambda line: None)
+        run(config, finished, "mxi", say=lambda line: None)
 
 
 @pytest.mark.slow
@@ -147,36 +152,36 @@ def test_a_killed_run_ends_as_an_uninterrupted_one(config: Config, finished: Pat
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert not (tmp_path / "run/steps/report.json").exists()
-    pipeline.run(config, tmp_path / "run", say=lambda line: None)
+    run(config, tmp_path / "run", say=lambda line: None)
     assert artefacts(tmp_path / "run") == artefacts(finished)
 
 
 def test_redoing_a_step_gives_the_same_again(config: Config, finished: Path):
     before = artefacts(finished)
-    pipeline.run(config, finished, "evaluate", say=lambda line: None)
+    run(config, finished, "evaluate", say=lambda line: None)
     assert artefacts(finished) == before
 
 
 def test_the_page_can_be_written_again(finished: Path):
     (finished / "report.html").unlink()
-    assert pipeline.report_again(finished).exists()
+    assert report_again(finished).exists()
 
 
 def test_a_comparison_goes_on_only_with_the_same_request(config: Config, finished: Path, tmp_path: Path):
     agent = str(finished / "distill/offline-dqn/agent")
     out = tmp_path / "comparison"
-    rows = pipeline.compare(config, ["slower", agent], out)
+    rows = compare(config, ["slower", agent], out)
     assert {row.agent for row in rows} == {"slower", "offline DQN"}
     assert (out / "results.png").exists()
-    assert pipeline.compare(config, ["slower", agent], out) == rows
+    assert compare(config, ["slower", agent], out) == rows
     with pytest.raises(RapidError, match="Choose another --out"):
-        pipeline.compare(config, ["idle", agent], out)
+        compare(config, ["idle", agent], out)
 
 
 def test_two_agents_of_one_name_stay_apart(config: Config, finished: Path, tmp_path: Path):
     agent = finished / "distill/offline-dqn/agent"
     shutil.copytree(agent, tmp_path / "other")
-    rows = pipeline.compare(config, [str(agent), str(tmp_path / "other")], tmp_path / "comparison")
+    rows = compare(config, [str(agent), str(tmp_path / "other")], tmp_path / "comparison")
     assert {row.agent for row in rows} == {f"offline DQN ({path})" for path in (agent, tmp_path / "other")}
 
 
@@ -203,7 +208,7 @@ def test_steps_that_cannot_follow_are_refused_before_any_work(
     config: Config, tmp_path: Path, overrides: dict[str, object], says: str
 ):
     with pytest.raises(RapidError, match=says):
-        pipeline.run(apply_overrides(config, overrides), tmp_path / "run", say=lambda line: None)
+        run(apply_overrides(config, overrides), tmp_path / "run", say=lambda line: None)
     assert not (tmp_path / "run").exists()
 
 
@@ -219,7 +224,7 @@ def test_phase_3_goes_on_by_ppo_from_any_agent(config: Config, finished: Path, t
     halves.append(replace(config, adapt=replace(config.adapt, steps=0)))
     start, agents = finished / "distill/rapid/agent", []
     for number, half in enumerate(halves):
-        pipeline.adapt_agent(half, start, finished / "mix", tmp_path / f"{number}")
+        adapt_agent(half, start, finished / "mix", tmp_path / f"{number}")
         start = tmp_path / f"{number}" / "agent"
         agents.append(rapid.load_agent(start).network.state_dict())
     whole = rapid.load_agent(finished / "adapt/rapid/agent").network.state_dict()
@@ -232,7 +237,7 @@ def test_from_phase_3_on_left_and_right_may_be_made_alike(config: Config, finish
     start, found = finished / "distill/rapid/agent", {}
     for mirror, steps in ((True, 0), (True, 40), (False, 40)):
         adapt, out = replace(config.adapt, mirror=mirror, steps=steps, ppo=PpoConfig()), tmp_path / f"{mirror}-{steps}"
-        pipeline.adapt_agent(replace(config, adapt=adapt), start, None, out)
+        adapt_agent(replace(config, adapt=adapt), start, None, out)
         network = rapid.load_agent(out / "agent").network
         assert network.config.mirror == mirror
         found[mirror, steps] = network.state_dict()
@@ -245,18 +250,18 @@ def test_from_phase_3_on_left_and_right_may_be_made_alike(config: Config, finish
             run_episodes(rapid.load_agent(tmp_path / "True-0" / "agent"), name, [900_000])
         adapt = replace(config.adapt, mirror=True, scenario=name)
         with pytest.raises(RapidError, match="mirror image on 3 lanes"):
-            pipeline.adapt_agent(replace(config, adapt=adapt), start, None, tmp_path / name)
+            adapt_agent(replace(config, adapt=adapt), start, None, tmp_path / name)
     elsewhere = replace(config, scenario="lane-4-density-1")
     with pytest.raises(RapidError, match="mirror image on 3 lanes"):
-        pipeline.compare(elsewhere, ["slower", str(tmp_path / "True-0" / "agent")], tmp_path / "comparison")
+        compare(elsewhere, ["slower", str(tmp_path / "True-0" / "agent")], tmp_path / "comparison")
     assert not (tmp_path / "comparison").exists()
     adapt = replace(config.adapt, mirror=True, steps=0, ppo=PpoConfig())
     with pytest.raises(RapidError, match="would replace the agent itself"):
-        pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "True-40/agent", None, tmp_path / "True-40")
+        adapt_agent(replace(config, adapt=adapt), tmp_path / "True-40/agent", None, tmp_path / "True-40")
 
 
 def test_a_run_whose_agent_sees_more_than_the_others_has_its_page(config: Config, tmp_path: Path):
-    pipeline.run(apply_overrides(config, {"adapt": {"vehicles": 31}}), tmp_path / "run", say=lambda line: None)
+    run(apply_overrides(config, {"adapt": {"vehicles": 31}}), tmp_path / "run", say=lambda line: None)
     assert rapid.load_agent(tmp_path / "run/adapt/rapid/agent").vehicles == 31
     assert "after adaptation" in (tmp_path / "run/report.html").read_text()
 
@@ -266,7 +271,7 @@ def test_from_phase_3_on_more_may_be_seen(
 ):
     start = finished / "distill/rapid/agent"
     adapt = replace(config.adapt, vehicles=31)
-    pipeline.adapt_agent(replace(config, adapt=adapt), start, finished / "mix", tmp_path / "far")
+    adapt_agent(replace(config, adapt=adapt), start, finished / "mix", tmp_path / "far")
     agent = rapid.load_agent(tmp_path / "far/agent")
     assert agent.vehicles == agent.network.config.vehicles == 31
     assert json.loads((tmp_path / "far/agent/config.json").read_text())["vehicles"] == 31
@@ -288,17 +293,17 @@ def test_from_phase_3_on_more_may_be_seen(
     # Once it sees so far it goes on so, by itself or told the same; it cannot go back.
     for vehicles, out in ((0, "kept"), (31, "told")):
         adapt = replace(config.adapt, vehicles=vehicles, ppo=PpoConfig())
-        pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "far/agent", None, tmp_path / out)
+        adapt_agent(replace(config, adapt=adapt), tmp_path / "far/agent", None, tmp_path / out)
         assert rapid.load_agent(tmp_path / out / "agent").vehicles == 31
     adapt = replace(config.adapt, vehicles=20)
     with pytest.raises(RapidError, match="reads 31 vehicles"):
-        pipeline.adapt_agent(replace(config, adapt=adapt), tmp_path / "far/agent", None, tmp_path / "back")
+        adapt_agent(replace(config, adapt=adapt), tmp_path / "far/agent", None, tmp_path / "back")
 
 
 def test_what_was_distilled_is_what_forgetting_is_told_of(config: Config, finished: Path, tmp_path: Path):
     adapt = replace(config.adapt, mirror=True)
     agent = finished / "distill/rapid/agent"
-    pipeline.adapt_agent(replace(config, adapt=adapt), agent, finished / "mix", tmp_path)
+    adapt_agent(replace(config, adapt=adapt), agent, finished / "mix", tmp_path)
     network = rapid.load_agent(tmp_path / "agent").network
     states = torch.from_numpy(load_dataset(finished / "mix").transitions.obs_NVF)
     distilled = rapid.load_agent(agent).network
@@ -309,19 +314,19 @@ def test_what_was_distilled_is_what_forgetting_is_told_of(config: Config, finish
 
 
 def test_adapting_needs_no_dataset(config: Config, finished: Path, tmp_path: Path):
-    agent = pipeline.adapt_agent(config, finished / "distill/rapid/agent", None, tmp_path / "adapted")
+    agent = adapt_agent(config, finished / "distill/rapid/agent", None, tmp_path / "adapted")
     assert rapid.load_agent(tmp_path / "adapted" / "agent").name == agent.name
 
 
 def test_a_damaged_artefact_stops_the_run_and_is_left_as_it_is(config: Config, finished: Path, tmp_path: Path):
     directory = tmp_path / "run"
     shutil.copytree(finished, directory)
-    for step in pipeline.STEPS[1:]:
+    for step in STEPS[1:]:
         (directory / "steps" / f"{step}.json").unlink()
     damaged = directory / "collect/teacher/transitions.parquet"
     damaged.write_bytes(damaged.read_bytes()[:1000])
     with pytest.raises(RapidError, match="cut off"):
-        pipeline.run(config, directory, say=lambda line: None)
+        run(config, directory, say=lambda line: None)
     assert damaged.stat().st_size == 1000
 
 
@@ -329,13 +334,13 @@ def test_baselines_have_the_papers_printed_sizes_in_its_recipe():
     def sizes(recipe: str) -> dict[str, tuple[float, int, int]]:
         found = {}
         for name in ("dqn", "ddqn", "cql"):
-            optimizer = pipeline.baseline(preset(recipe, "full"), name).distill.optimizer
+            optimizer = baseline(preset(recipe, "full"), name).distill.optimizer
             found[name] = (optimizer.learning_rate, optimizer.batch_size, optimizer.target_update)
         return found
 
     assert sizes("paper") == {"dqn": (5e-3, 32, 50), "ddqn": (5e-4, 32, 50), "cql": (5e-4, 64, 50)}
     assert len(set(sizes("strong").values())) == 1
-    terms = {name: pipeline.baseline(preset("paper"), name).distill.loss for name in ("dqn", "ddqn", "cql", "bc")}
+    terms = {name: baseline(preset("paper"), name).distill.loss for name in ("dqn", "ddqn", "cql", "bc")}
     assert {name for name, loss in terms.items() if loss.conservative_weight} == {"cql"}
     assert {name for name, loss in terms.items() if loss.double} == {"ddqn", "cql"}
     assert not any(loss.robust_weight for loss in terms.values())

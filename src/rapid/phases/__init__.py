@@ -1,0 +1,1 @@
+"""The phases on disk: each function reads directories and writes one, for the verbs and the experiments alike."""

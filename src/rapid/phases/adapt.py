@@ -1,0 +1,78 @@
+"""Phase 3 on disk: let an agent learn online, by Q-learning and then by PPO."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from rapid.agents.open import check_road
+from rapid.agents.saved import QAgent, load_agent, save_agent
+from rapid.config import Config, without_place
+from rapid.config_io import to_dict
+from rapid.data.dataset import load_dataset
+from rapid.errors import RapidError
+from rapid.networks.q_network import widened
+from rapid.phases.data import learnable
+from rapid.phases.measure import learning_curve
+from rapid.progress import task
+from rapid.scenarios import get_scenario, seeing
+from rapid.seeding import stream_seed
+from rapid.simulator import make_vec
+from rapid.tracking import Tracker
+from rapid.training.machinery.diagnostics import Forgetting
+from rapid.training.online import adapt
+from rapid.training.ppo import adapt_by_ppo
+
+PPO = "ppo"
+"""Where, beside the record of phase 3's Q-learning, that of its second part lies."""
+
+
+def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name: str = "RAPID") -> QAgent:
+    """Let the agent in `agent` learn online in the target scenario; it is written to ``out/agent``."""
+    distilled = load_agent(agent, config.device)
+    scenario = config.adapt.scenario or distilled.metadata.get("scenario", config.scenario)
+    settings = config.adapt if data else replace(config.adapt, offline_share=0.0)
+    network, seed = distilled.network, stream_seed(config.seed, "adapt")
+    if agent.resolve() == (out / "agent").resolve():
+        raise RapidError(f"Adapting '{agent}' into '{out}' would replace the agent itself. Choose another directory.")
+    offline = learnable(load_dataset(data)) if data else None
+    # Of what was distilled, before it is mirrored or sees farther.
+    forgetting = Forgetting(network, offline, seed)
+    if settings.vehicles:
+        network = widened(network, settings.vehicles)
+    if settings.mirror:
+        network.config = replace(network.config, mirror=True)
+    check_road(QAgent(network, distilled.name), scenario)
+    evaluate, seen = learning_curve(config, scenario, name), seeing(network.config.vehicles)
+    tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
+    rollout = settings.ppo.num_envs * settings.ppo.rollout
+    total = settings.steps + settings.ppo.steps // rollout * rollout
+    with tracker, task(f"adapt, {name}", total, "steps") as work:
+        if settings.steps:
+            adapt(
+                network,
+                settings,
+                scenario,
+                out,
+                seed=seed,
+                offline=offline,
+                evaluate=evaluate,
+                progress=work,
+                make_worlds=lambda count: make_vec(scenario, count, config.simulator, config=seen),
+                track=tracker.log,
+            )
+        if settings.ppo.steps:
+            timed = replace(get_scenario(scenario), clock=True)
+            adapt_by_ppo(
+                network,
+                settings,
+                scenario,
+                out / PPO,
+                seed=seed,
+                forgetting=forgetting,
+                evaluate=evaluate,
+                progress=work,
+                make_worlds=lambda count: make_vec(timed, count, config.simulator, config=seen),
+                track=tracker.log,
+            )
+    metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
+    save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
+    return QAgent(network, name)

@@ -1,0 +1,36 @@
+"""What can be seen to be wrong with the settings before any work starts."""
+
+import torch
+
+from rapid.attacks import get_attack
+from rapid.config import Config
+from rapid.config_io import validate
+from rapid.data.collection import parse_shard
+from rapid.engines import check_engine
+from rapid.errors import RapidError
+from rapid.scenarios import get_scenario
+from rapid.teacher import check_teacher
+from rapid.tracking import check_tracking
+
+
+def check(config: Config) -> None:
+    """Look for everything that can be seen to be wrong before any work starts.
+
+    Raises:
+        RapidError: the first thing found.
+    """
+    validate(config)
+    torch.set_num_threads(config.threads)
+    try:
+        torch.empty(0, device=config.device)
+    except (RuntimeError, AssertionError) as error:
+        raise RapidError(
+            f"Device '{config.device}' cannot be used: {str(error).splitlines()[0].rstrip('.')}. Use --device cpu."
+        ) from error
+    lanes = get_scenario(config.scenario).lanes
+    for name in config.evaluate.attacks:
+        get_attack(name, lanes)
+    parse_shard(config.collect.shard)
+    check_engine(config.collect.engine)
+    check_tracking(config.tracking)
+    check_teacher(config.teacher, lanes)

@@ -1,0 +1,152 @@
+"""Measuring on disk: agents over the test spawns, each driven once, with table and plot."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rapid.agents.open import PLANNERS, check_road, open_agent
+from rapid.agents.saved import QAgent
+from rapid.config import Config
+from rapid.config_io import to_dict
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
+from rapid.evaluation.recording import save_recordings
+from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
+from rapid.evaluation.summary import summary_text
+from rapid.files import read_json, sha256, write_json, write_text
+from rapid.networks.q_network import QNetwork
+from rapid.phases.checks import check
+from rapid.phases.data import given_data
+from rapid.progress import task
+from rapid.report import ReportData, write_figures
+from rapid.runs import commit
+from rapid.scenarios import get_scenario
+from rapid.spawns import spawn_seeds
+from rapid.teacher import make_teacher
+from rapid.teacher.models import is_present
+
+FLOORS = ("slower", "idle", "random", "rule")
+"""Scripted drivers that stand under every score."""
+TEACHER = "teacher"
+"""The configured teacher, as an agent to be measured."""
+PLANNER = "planner"
+"""Search with the simulator itself as its model: a reference, no bound."""
+RECORDED = 4
+"""Episodes of the adapted agent, and of the teacher, that the report can play."""
+
+
+def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
+    """Drive the agents named and write rows, table and plot to `out`; `teacher` is the configured teacher."""
+    check(config)
+    names = [str(_open(config, spec, config.scenario).name) for spec in specs]
+    # Two trainings of the same name would fall into one row of the table.
+    labels = {spec: f"{name} ({spec})" for spec, name in zip(specs, names, strict=True) if names.count(name) > 1}
+    files = [Path(spec) / "config.json" if Path(spec).is_dir() else Path(spec) for spec in specs]
+    request = {
+        "agents": [[spec, sha256(file) if file.is_file() else ""] for spec, file in zip(specs, files, strict=True)],
+        "teacher": to_dict(config.teacher) if TEACHER in specs else None,
+        "scenario": config.scenario,
+        "simulator": config.simulator,
+        "seed": config.seed,
+        "evaluate": to_dict(config.evaluate) | {"attacks": list(config.evaluate.attacks)},
+    }
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if not (out / "request.json").exists() or read_json(out / "request.json") != request:
+            raise RapidError(f"'{out}' holds something else than this comparison. Choose another --out, or empty it.")
+    else:
+        write_json(out / "request.json", request)
+    rows = measure(config, config.scenario, specs, out, labels)
+    write_figures(ReportData(title=f"{config.scenario}", rows=rows), out)
+    return rows
+
+
+def why_no_teacher(config: Config) -> str:
+    """Why the teacher is not measured, or nothing. A run on given data measures their driver, and fetches no model."""
+    if not config.data:
+        return ""
+    driver, settings = given_data(config)[0].drivers.get("teacher", {}), config.teacher
+    if (driver.get("backend"), driver.get("model")) != (settings.backend, settings.model):
+        return (
+            f"The teacher is not measured: {driver.get('name', 'another')} drove in the data, and the settings name "
+            f"{settings.backend} {settings.model}."
+        )
+    if settings.backend == "local" and not is_present(settings.model):
+        return (
+            f"The teacher is not measured: {settings.model} is not on this machine, and a run on given data fetches no "
+            f"model. To have its row: rapid models pull {settings.model}, then this run with --from evaluate."
+        )
+    return ""
+
+
+def _open(config: Config, spec: str, scenario: str) -> Any:
+    if spec == TEACHER:
+        return make_teacher(config.teacher, get_scenario(scenario).lanes, config.seed)
+    agent = open_agent(spec, scenario, config.seed, config.device)
+    check_road(agent, scenario)
+    return agent
+
+
+def measure(
+    config: Config, scenario: str, specs: Sequence[str], out: Path, labels: Mapping[str, str] | None = None
+) -> list[EpisodeRow]:
+    """Drive every agent over the test spawns under every attack; an agent that is done is not driven again.
+
+    An empty name only takes a number. `labels` are names for agents whose own would not tell them apart.
+    """
+    rows: list[EpisodeRow] = []
+    for number, spec in enumerate(specs):
+        if not spec:
+            continue
+        part = out / "parts" / f"{number:02}.parquet"
+        if not part.exists():
+            agent = _open(config, spec, scenario)
+            if labels and spec in labels:
+                agent.name = labels[spec]
+            episodes = _drive(config, scenario, spec, agent)
+            if recordings := [recording for of in episodes for recording in of.recordings[:RECORDED]]:
+                save_recordings(part.with_suffix(".recordings.json"), recordings)
+            source = commit()
+            save_rows(
+                part, [row for of in episodes for row in of.rows(config.seed if of.has_network else None, source)]
+            )
+        rows += load_rows(part)
+    save_rows(out / "episodes.parquet", rows)
+    write_text(out / "summary.txt", summary_text(rows) + "\n")
+    return rows
+
+
+def _drive(config: Config, scenario: str, spec: str, agent: Any) -> list[Episodes]:
+    spawns, attacks = config.evaluate.spawns, config.evaluate.attacks
+    if spec == TEACHER:
+        # A language model takes long over a decision: fewer spawns, and only as it drives undisturbed.
+        spawns, attacks = config.evaluate.teacher_spawns, ("none",)
+    elif spec in PLANNERS:
+        spawns = config.evaluate.planner_spawns
+    attacks = [name for name in attacks if is_applicable(agent, name)]
+    with task(f"evaluate, {agent.name}", spawns * len(attacks), "episodes") as work:
+        return [
+            run_episodes(
+                agent,
+                scenario,
+                spawn_seeds("test", spawns),
+                attack,
+                generator_seed=config.seed,
+                record=attack == "none" and (spec == TEACHER or agent.name == "RAPID"),
+                simulator=config.simulator,
+                progress=work.advance,
+            )
+            for attack in attacks
+        ]
+
+
+def learning_curve(config: Config, scenario: str, name: str) -> Callable[[QNetwork, int], dict[str, float]] | None:
+    """What a trainer calls to put a point on the learning curve: clean return and crash share on tuning spawns."""
+    if config.evaluate.curve_spawns == 0:
+        return None
+    seeds = spawn_seeds("tune", config.evaluate.curve_spawns)
+
+    def evaluate(network: QNetwork, iteration: int) -> dict[str, float]:
+        episodes = run_episodes(QAgent(network, name), scenario, seeds, simulator=config.simulator)
+        return {"return": float(episodes.return_E.mean()), "crash_share": float(episodes.crashed_E.mean())}
+
+    return evaluate

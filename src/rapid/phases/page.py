@@ -1,0 +1,94 @@
+"""The page of a run, gathered from what its steps left."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rapid.agents.saved import load_agent
+from rapid.config import Config, preset
+from rapid.config_io import apply_overrides, to_dict
+from rapid.data.dataset import load_dataset, summary
+from rapid.evaluation.metrics import load_rows
+from rapid.evaluation.recording import Recording, load_recordings
+from rapid.files import read_json
+from rapid.phases.adapt import PPO
+from rapid.phases.data import data_folders
+from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
+from rapid.runs import STEPS
+from rapid.training.machinery.record import load_metrics
+
+
+def report_again(directory: Path) -> Path:
+    """Write the page of a finished run again and return its path.
+
+    Raises:
+        RapidError: there is no run, or it has not been measured yet.
+    """
+    manifest = read_json(directory / "run.json", "run manifest")
+    config = apply_overrides(preset(), manifest.get("config", {}), source=f"'{directory / 'run.json'}'")
+    return write_run_report(config, directory)
+
+
+def write_run_report(config: Config, directory: Path) -> Path:
+    """Gather the artefacts of a run into ``report.html`` and the figures beside it."""
+    manifest = read_json(directory / "run.json", "run manifest")
+    steps = {step: directory / "steps" / f"{step}.json" for step in STEPS}
+    recordings = [
+        recording
+        for path in sorted((directory / "evaluate" / "parts").glob("*.recordings.json"), reverse=True)
+        for recording in load_recordings(path)
+    ]
+    teacher_data = load_dataset(data_folders(config, directory)[0])
+    notes = []
+    if config.data:
+        notes.append(f"Nothing was collected in this run; its data: {config.data}.")
+    measured = read_json(steps["evaluate"]) if steps["evaluate"].exists() else {}
+    if "note" in measured:
+        notes.append(measured["note"])
+    if config.scale in ("tiny", "quick"):
+        notes.append(f"Scale {config.scale}: one training seed and few spawns. This shows that it works, not how well.")
+    data = ReportData(
+        title=f"RAPID on {config.adapt.scenario or config.scenario}",
+        settings=to_dict(config),
+        versions=manifest["versions"],
+        commit=manifest["commit"],
+        command=f"rapid run --config {directory / 'config.toml'} --directory {directory}",
+        started=manifest["started"],
+        timings={step: read_json(path)["seconds"] for step, path in steps.items() if path.exists()},
+        rows=load_rows(directory / "evaluate" / "episodes.parquet"),
+        main_agent="RAPID",
+        distill={
+            "distilled": load_metrics(directory / "distill" / "rapid"),
+            "offline DQN": load_metrics(directory / "distill" / "offline-dqn"),
+            "behaviour cloning": load_metrics(directory / "distill" / "cloning"),
+        },
+        adapt={"RAPID": [row for part in _parts(config, directory / "adapt" / "rapid") for row in load_metrics(part)]},
+        routing=_routing(config, directory, recordings),
+        recordings=recordings,
+        dataset={"driver": teacher_data.drivers, **summary(teacher_data)},
+        notes=notes,
+    )
+    write_figures(data, directory / "figures")
+    return write_report(data, directory / "report.html")
+
+
+def _parts(config: Config, directory: Path) -> list[Path]:
+    """Where the records of phase 3 lie, in their order."""
+    parts = {directory: config.adapt.steps, directory / PPO: config.adapt.ppo.steps}
+    return [part for part, steps in parts.items() if steps]
+
+
+def _routing(config: Config, directory: Path, recordings: Sequence[Recording]) -> list[RoutingSnapshot]:
+    """The routing weights in one scene of RAPID's first recorded episode, before and after adaptation."""
+    recording = next((recording for recording in recordings if recording.agent == "RAPID"), None)
+    if recording is None or config.network.kind != "rapid":
+        return []
+    obs_VF = recording.obs_TVF[len(recording.action_T) // 2]
+    snapshots = []
+    for label, phase in (("before adaptation", "distill"), ("after adaptation", "adapt")):
+        agent = load_agent(directory / phase / "rapid" / "agent")
+        # What was distilled may see fewer: the nearest, which come first.
+        seen_VF = obs_VF[: agent.vehicles]
+        weights_BVN = agent.explain(seen_VF[None]).weights_BVN
+        if weights_BVN is not None:
+            snapshots.append(RoutingSnapshot(label, weights_BVN[0].numpy(), seen_VF))
+    return snapshots
