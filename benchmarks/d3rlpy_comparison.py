@@ -32,7 +32,7 @@ import numpy as np
 import torch
 
 from rapid.agents.saved import QAgent
-from rapid.config import DistillConfig, NetworkConfig, preset
+from rapid.config import DistillConfig, NetworkConfig
 from rapid.data.batch import TransitionBatch
 from rapid.data.dataset import Dataset, load_dataset, save_dataset
 from rapid.data.exchange import export_d3rlpy
@@ -46,6 +46,7 @@ from rapid.networks.q_network import QNetwork, build_network
 from rapid.networks.stack import stack_networks
 from rapid.phases.data import collect_transitions
 from rapid.phases.distill import baseline
+from rapid.presets import preset
 from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import get_scenario

@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from rapid.config import Config, preset
+from rapid.config import Config
 from rapid.data.dataset import Dataset, load_dataset, mix
 from rapid.data.replay import OfflineSampler
 from rapid.files import write_json, write_text
 from rapid.networks.q_network import build_network, set_phase
+from rapid.presets import preset
 from rapid.progress import task
 from rapid.runs import commit
 from rapid.scenarios import get_scenario

@@ -31,7 +31,7 @@ import numpy as np
 
 from rapid.agents.open import open_agent
 from rapid.agents.saved import load_agent
-from rapid.config import AdaptConfig, Config, PpoConfig, TeacherConfig, preset
+from rapid.config import AdaptConfig, Config, PpoConfig, TeacherConfig
 from rapid.config_io import apply_overrides, to_dict
 from rapid.data.dataset import load_dataset, save_dataset
 from rapid.data.relabel import relabel
@@ -48,6 +48,7 @@ from rapid.phases.checks import check
 from rapid.phases.data import collect_transitions, mix_datasets
 from rapid.phases.distill import baseline, distill_agent
 from rapid.phases.measure import TEACHER
+from rapid.presets import preset
 from rapid.progress import task
 from rapid.report.data import paper_return
 from rapid.runs import commit

@@ -21,13 +21,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rapid.config import Config, LossConfig, NetworkConfig, preset
+from rapid.config import Config, LossConfig, NetworkConfig
 from rapid.data.batch import TransitionBatch
 from rapid.data.dataset import Dataset, load_dataset
 from rapid.data.replay import OfflineSampler
 from rapid.files import write_json, write_text
 from rapid.networks.mixture import MixtureOfPolicies
 from rapid.networks.q_network import QNetwork, TokenHead, build_network, set_phase
+from rapid.presets import preset
 from rapid.progress import task
 from rapid.runs import commit
 from rapid.scenarios import get_scenario

@@ -59,7 +59,7 @@ def test_verbs_without_options_run(capsys: pytest.CaptureFixture[str]):
         (["collect", "--scenario", "lane-0-density-2"], "1 to 20 lanes"),
         (["mix", "nowhere", "nothing", "--out", "x"], "nowhere"),
         (["distill", "nowhere"], "nowhere"),
-        (["distill", "nowhere", "--seeds", "0"], "--seeds 0"),
+        (["distill", "nowhere", "--seeds", "0"], "'seeds' is 0"),
         (["adapt", "nowhere"], "nowhere"),
         (["evaluate", "nobody"], "nobody"),
         (["evaluate", "slower", "--scenario", "highway"], "Unknown scenario"),

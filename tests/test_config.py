@@ -1,4 +1,6 @@
 import dataclasses
+import functools
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -8,9 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rapid import config as settings
-from rapid.config import Config, preset
+from rapid.bounds import Bounds, numbers
+from rapid.config import Config
 from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate
 from rapid.errors import RapidError
+from rapid.presets import preset
 
 PRESETS = [(recipe, scale) for recipe in settings.RECIPES for scale in settings.SCALES]
 
@@ -67,7 +71,7 @@ def test_long_adaptation_differs_in_phase_3_alone_and_the_paper_stays_as_printed
 
 
 def test_every_field_has_a_docstring():
-    kinds = [kind for kind in vars(settings).values() if dataclasses.is_dataclass(kind)]
+    kinds = [kind for kind in vars(settings).values() if dataclasses.is_dataclass(kind) and kind is not Bounds]
     assert len(kinds) > 8
     assert [name for kind in kinds for name in fields_without_docs(kind)] == []  # pyright: ignore[reportArgumentType]
 
@@ -171,3 +175,41 @@ def test_the_tree_is_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
         preset().seed = 1  # pyright: ignore[reportAttributeAccessIssue]
     assert isinstance(preset(), Config)
+
+
+def test_every_number_has_bounds_and_the_defaults_lie_within():
+    from rapid.verbs import _VERBS
+
+    def bare(settings: Any) -> list[str]:
+        return [name for name, number, bounds in numbers(settings) if bounds is None or not bounds.hold(number)]
+
+    assert len(list(numbers(Config()))) > 70
+    assert bare(Config()) == []
+    for kind, _ in _VERBS.values():
+        given = [item.name for item in dataclasses.fields(kind) if item.default is dataclasses.MISSING]
+        required = [
+            name
+            for name in given
+            if kind.__dataclass_fields__[name].default_factory is dataclasses.MISSING  # no default at all
+        ]
+        assert bare(kind(**dict.fromkeys(required, ""))) == [], kind
+
+
+@pytest.mark.parametrize("name", sorted({name for name, _, _ in numbers(Config())}))
+def test_every_number_beyond_its_bounds_is_refused_by_name(name: str):
+    bounds = next(bounds for each, _, bounds in numbers(Config()) if each == name)
+    assert bounds is not None
+    below = bounds.low if bounds.open_low else bounds.low - 1
+    *path, last = name.split(".")
+    inner = functools.reduce(getattr, path, Config())
+    kind = type(getattr(inner, last))
+    wrong: Any = (int(below),) if kind is tuple else kind(below)
+    overrides: Any = functools.reduce(lambda found, key: {key: found}, reversed(path), {last: wrong})
+    with pytest.raises(RapidError, match=f"'{re.escape(name)}'"):
+        validate(apply_overrides(Config(), overrides))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_numbers_that_are_not_finite_are_refused(bad: float):
+    with pytest.raises(RapidError, match="finite"):
+        validate(dataclasses.replace(Config(), mix=dataclasses.replace(Config().mix, p=bad)))

@@ -17,7 +17,7 @@ import torch
 
 import rapid
 from rapid.agents.saved import QAgent
-from rapid.config import Config, PpoConfig, preset
+from rapid.config import Config, PpoConfig
 from rapid.config_io import apply_overrides
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
@@ -28,6 +28,7 @@ from rapid.phases.adapt import adapt_agent
 from rapid.phases.distill import baseline, distill_agent, distill_seeds
 from rapid.phases.measure import compare
 from rapid.phases.page import report_again
+from rapid.presets import preset
 from rapid.run import run
 from rapid.runs import STEPS
 from rapid.scenarios import SLOWER

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from rapid.config import PpoConfig, preset
+from rapid.config import PpoConfig
 from rapid.config_io import apply_overrides, load_toml
 from rapid.errors import RapidError
 from rapid.files import read_json
+from rapid.presets import preset
 from rapid.runs import RunDirectory
 
 STEPS = ("collect", "mix", "distill")

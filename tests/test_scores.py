@@ -10,11 +10,11 @@ import pytest
 
 from rapid.agents.open import open_agent
 from rapid.agents.saved import save_agent
-from rapid.config import preset
 from rapid.config_io import to_dict
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.q_network import build_network
+from rapid.presets import preset
 from rapid.spawns import spawn_seeds
 from rapid.teacher.scripted import Scripted
 

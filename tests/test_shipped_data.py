@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rapid.config import Config, TeacherConfig, preset
+from rapid.config import Config, TeacherConfig
 from rapid.config_io import apply_overrides
 from rapid.data.card import card
 from rapid.data.dataset import load_dataset
@@ -18,6 +18,7 @@ from rapid.evaluation.teachers import drive_teacher
 from rapid.files import read_json
 from rapid.phases.measure import why_no_teacher
 from rapid.phases.page import report_again
+from rapid.presets import preset
 from rapid.run import run
 from rapid.scenarios import PAPER_SCENARIOS
 from rapid.teacher import make_teacher

@@ -10,17 +10,10 @@ import pytest
 
 from fake_worlds import fake_transitions
 from rapid import tracking
-from rapid.config import (
-    Config,
-    DistillConfig,
-    LossConfig,
-    NetworkConfig,
-    OptimizerConfig,
-    preset,
-    without_place,
-)
+from rapid.config import Config, DistillConfig, LossConfig, NetworkConfig, OptimizerConfig, without_place
 from rapid.errors import RapidError
 from rapid.networks.q_network import build_network
+from rapid.presets import preset
 from rapid.tracking import Tracker, check_tracking, numbers_of
 from rapid.training import distill, offline
 from rapid.training.learner import Learner

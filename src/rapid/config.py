@@ -1,29 +1,22 @@
-"""The one tree of settings: frozen dataclasses, a docstring under each field, recipes, scales and TOML.
+"""The one tree of settings: frozen dataclasses, bounds and a docstring at each field.
 
 A *recipe* says how things are trained: ``paper`` uses the numbers as printed, even where they handicap someone;
-``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run: ``tiny`` (CI),
-``quick`` (a coffee), ``full`` (the paper's data and online steps), ``long`` (thirty times its online steps; in the
-recipe ``strong``, 700,000 by PPO after them).
-Precedence, low to high: recipe and scale, ``--config FILE.toml``, options (:mod:`rapid.config_io`). This module imports
-nothing heavy.
+``strong`` uses what a good practitioner would, for every method. A *scale* says how much is run. Precedence, low to
+high: recipe and scale (:mod:`rapid.presets`), ``--config FILE.toml``, options (:mod:`rapid.config_io`). This module
+imports nothing heavy.
 """
 
 import typing
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
-from rapid.errors import RapidError, did_you_mean
-from rapid.scenarios import NUM_VEHICLES
+from rapid.bounds import AboveZero, Amount, Bounds, Count, Positive, Seed, Share, ShareAboveZero, ShareBelowOne
+from rapid.scenarios import MAX_VEHICLES, MIN_VEHICLES, NUM_VEHICLES
 
 Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full", "long"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
-
-LONG_STEPS = 300_000
-"""Online steps of Q-learning of the scale `long`."""
-LONG_PPO_STEPS = 700_000
-"""The steps by PPO after them, in the recipe `strong`."""
 
 
 @dataclass(frozen=True)
@@ -44,32 +37,32 @@ class TeacherConfig:
     """Address of the OpenAI-compatible server (`endpoint`)."""
     api_key_env: str = "OPENAI_API_KEY"
     """Environment variable that holds the key; the key itself is never written anywhere."""
-    concurrency: int = 8
+    concurrency: Positive = 8
     """Requests in flight at once (`endpoint`)."""
-    requests_per_minute: float = 0.0
+    requests_per_minute: Amount = 0.0
     """Upper bound on requests per minute; 0 is no bound (`endpoint`)."""
-    timeout_s: float = 60.0
+    timeout_s: AboveZero = 60.0
     """Seconds to wait for one answer (`endpoint`)."""
-    max_retries: int = 4
+    max_retries: Count = 4
     """Tries after the first for a failed request, with backoff (`endpoint`)."""
     tool_calling: Literal["auto", "native", "text"] = "auto"
     """How tools are called (`react`, `endpoint`): the server's own way, plain text, or the former until it refuses."""
-    max_answer_tokens: int = 400
+    max_answer_tokens: Positive = 400
     """Tokens that one answer may have."""
     shuffle_facts: bool = False
     """Control: tell the facts of one action about another (`local`, `digest`), to see whether the model uses them."""
-    max_turns: int = 8
+    max_turns: Positive = 8
     """Tool calls allowed before a decision must be made (`react`)."""
-    price_in: float = 0.0
+    price_in: Amount = 0.0
     """Price of a million prompt tokens, in any currency; for the cost shown and budgeted."""
-    price_out: float = 0.0
+    price_out: Amount = 0.0
     """Price of a million answer tokens."""
     replay_file: str = ""
     """Recorded answers (`replay`)."""
     memory: str = ""
     """File of past situations that the model is reminded of, such as the `memory.jsonl` of a dataset; it is only read.
     With this or `reflect`, a `local` model in `digest` style answers in words instead of scoring them."""
-    few_shot: int = 0
+    few_shot: Count = 0
     """How many of the most similar past situations the model is shown at each decision; 0 is none."""
     reflect: bool = False
     """Remember each episode: its tightest moment, or after a crash what went wrong, which the model is asked. Written
@@ -80,29 +73,29 @@ class TeacherConfig:
 class CollectConfig:
     """Phase 1: how much is collected (paper: section 4.2)."""
 
-    teacher_transitions: int = 15_000
+    teacher_transitions: Count = 15_000
     """Transitions that the teacher drives; whole episodes are collected until there are at least as many."""
-    random_transitions: int = 15_000
+    random_transitions: Count = 15_000
     """Transitions of the uniformly random driver."""
-    lockstep: int = 16
+    lockstep: Positive = 16
     """Episodes driven side by side, so that the model sees a batch of prompts; a `local` model that converses answers
     all of them together."""
-    max_tokens: int = 0
+    max_tokens: Count = 0
     """Stop collecting when the teacher has read and written so many tokens; 0 is no limit."""
-    max_cost: float = 0.0
+    max_cost: Amount = 0.0
     """Stop when the teacher has cost so much (see `price_in`); 0 is no limit."""
-    max_seconds: float = 0.0
+    max_seconds: Amount = 0.0
     """Stop after so many seconds of collecting; 0 is no limit."""
-    max_decisions: int = 0
+    max_decisions: Count = 0
     """Stop before the teacher has made more decisions than this; 0 is no limit."""
     shard: str = "1/1"
     """Which part of the episodes this process collects, as `i/n`; for processes that you start yourself."""
     engine: Literal["local", "ray"] = "local"
     """Where workers run: on this machine, or on a Ray cluster (RAY_ADDRESS; every machine needs the same RAPID, and the
     API key, if any, in the environment that its `ray start` was given)."""
-    workers: int = 1
+    workers: Annotated[int, Bounds(1, 1000)] = 1
     """Parts of the collection that are under way at once, each with a teacher of its own."""
-    shards: int = 0
+    shards: Annotated[int, Bounds(0, 1000)] = 0
     """Into how many parts the collection is divided, which decides what is collected; 0 is one for each worker, or as
     many as the directory was begun with."""
 
@@ -111,9 +104,9 @@ class CollectConfig:
 class MixConfig:
     """The offline dataset: teacher and random transitions mixed (paper: section 4.2)."""
 
-    p: float = 0.5
+    p: Share = 0.5
     """Share of teacher transitions; the paper's best is 0.25, of 15,000."""
-    size: int = 30_000
+    size: Positive = 30_000
     """Number of transitions in the mixture."""
     level: Literal["transition", "batch"] = "transition"
     """`transition` draws the mixture once; `batch` keeps up to `size` of each source and mixes in every batch."""
@@ -126,21 +119,21 @@ class NetworkConfig:
     kind: Literal["rapid", "attentive", "mlp", "mlp-mixture"] = "rapid"
     """`rapid` is the mixture of policies, `attentive` its single policy, `mlp` the baselines' 2x256 network,
     `mlp-mixture` the remark's mixture of the *actions* of MLPs."""
-    num_policies: int = 2
+    num_policies: Positive = 2
     """N: policy 1 is distilled from the teacher, policies 2..N are online adapters."""
-    top_k: int = 2
+    top_k: Positive = 2
     """K: policies that are active for a vehicle; policy 1 always is, the others compete for K-1 places."""
-    width: int = 32
+    width: Positive = 32
     """D: width of a token."""
-    heads: int = 1
+    heads: Positive = 1
     """Attention heads."""
-    layers: int = 1
+    layers: Positive = 1
     """L: transformer layers of a policy."""
-    decoder_layers: int = 1
+    decoder_layers: Positive = 1
     """Transformer layers of the decoder; of its last only the token that is read is computed."""
-    feedforward: int = 64
+    feedforward: Positive = 64
     """Width of the feed-forward layers."""
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[Positive, ...] = (256, 256)
     """Hidden layers of the MLPs."""
     input: Literal["raw", "normalized", "ego", "near"] = "near"
     """What the network reads: the features as they are, scaled to +-1 by highway-env's own ranges, or
@@ -154,7 +147,7 @@ class NetworkConfig:
     """Zero gate: w1 = omega1, wi = g*omegai; or wi = tanh(g)*omegai, w1 = 1 - sum wi."""
     mask_absent: bool = True
     """Whether rows with presence 0 are hidden from attention, so that their contents never matter."""
-    vehicles: int = NUM_VEHICLES
+    vehicles: Annotated[int, Bounds(MIN_VEHICLES, MAX_VEHICLES)] = NUM_VEHICLES
     """V: rows that it reads, the ego's and those of the nearest others. Of data with more it learns from the first;
     data with fewer is as if the rest of the road were empty."""
     mirror: bool = False
@@ -168,12 +161,12 @@ class RobustConfig:
 
     norm: Literal["l2", "linf"] = "linf"
     """Norm of the ball."""
-    radius: float = 0.01
+    radius: Amount = 0.01
     """Attack radius: 0.01 means 2 m in x, 0.04*lanes m in y and 0.8 m/s in both velocities. With the paper's 0.1, ten
     times that, only ignoring the observation is robust."""
-    steps: int = 5
+    steps: Positive = 5
     """PGD steps."""
-    step_size: float = 0.004
+    step_size: AboveZero = 0.004
     """Length of a step."""
     random_start: bool = True
     """Start at a random point of the ball."""
@@ -185,30 +178,30 @@ class RobustConfig:
 class LossConfig:
     """The training loss: TD + conservative + robust (paper: equations 2 to 5)."""
 
-    discount: float = 0.9
+    discount: Share = 0.9
     """gamma"""
-    n_step: int = 1
+    n_step: Positive = 1
     """Rewards summed before bootstrapping; never across the end of an episode."""
     double: bool = True
     """Double DQN: the online network chooses the next action, the target network values it."""
-    munchausen_weight: float = 0.0
+    munchausen_weight: ShareBelowOne = 0.0
     """Above 0, Munchausen DQN (Vieillard et al., 2020): the target gets this share of temperature * log-probability of
     the action taken (at least -1), and is soft over the next actions; `double` then says nothing. It averages the
     errors of earlier estimates, which tells apart actions that earn nearly the same."""
-    munchausen_temperature: float = 0.03
+    munchausen_temperature: AboveZero = 0.03
     """Temperature of the softmax over Q-values in that target; in units of the reward."""
     td_error: Literal["huber", "squared"] = "squared"
     """Squared as equation 2 prints it, or Huber with threshold 1 as d3rlpy has it. Huber counts a crash, an error of
     several units, for little more than a slip: it learns something near the median, where a crash is rare."""
-    conservative_weight: float = 1.0
+    conservative_weight: Amount = 1.0
     """alpha: weight of logsumexp Q - Q(a)."""
-    robust_weight: float = 0.1
+    robust_weight: Amount = 0.1
     """beta: weight of the robust term."""
     robust_on: Literal["all", "teacher"] = "teacher"
     """Transitions that get the robust term."""
     robust_labels: Literal["hard", "soft"] = "hard"
     """The action taken, or the teacher's probabilities where they were recorded."""
-    temperature: float = 1.0
+    temperature: AboveZero = 1.0
     """T of the softmax over Q-values in the robust term."""
     robust: RobustConfig = field(default_factory=RobustConfig)
     """The inner attack."""
@@ -221,19 +214,19 @@ class OptimizerConfig:
     algorithm: Literal["dqn", "bc"] = "dqn"
     """`dqn` minimises the loss above (DQN, DDQN and CQL are its settings); `bc` is behaviour cloning, of the
     transitions that `loss.robust_on` names."""
-    learning_rate: float = 5e-4
+    learning_rate: AboveZero = 5e-4
     """Adam's step size."""
-    gate_rate: float = 1.0
+    gate_rate: AboveZero = 1.0
     """By what the step size of the zero gate is multiplied. A gate that stays small keeps the adapters out."""
     linear_decay: bool = True
     """Let the step size fall linearly to zero over the training."""
-    batch_size: int = 64
+    batch_size: Positive = 64
     """Transitions in a batch."""
-    target_update: int = 1
+    target_update: Positive = 1
     """Gradient steps between two updates of the target network."""
-    target_rate: float = 0.005
+    target_rate: ShareAboveZero = 0.005
     """Share of the online weights taken over at an update; 1 is a hard update."""
-    max_grad_norm: float = 10.0
+    max_grad_norm: Amount = 10.0
     """Gradients are clipped to this norm; 0 is no clipping."""
 
 
@@ -241,9 +234,9 @@ class OptimizerConfig:
 class DistillConfig:
     """Phase 2: offline distillation (paper: sections 3.2 and 4.3)."""
 
-    iterations: int = 4_000
+    iterations: Positive = 4_000
     """Gradient steps."""
-    evaluate_every: int = 1_000
+    evaluate_every: Count = 1_000
     """Gradient steps between two evaluations; 0 is never."""
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss of this phase."""
@@ -255,35 +248,35 @@ class DistillConfig:
 class PpoConfig:
     """The second part of phase 3: policy gradients on the return itself (PPO; :mod:`rapid.training.ppo`)."""
 
-    steps: int = 0
+    steps: Count = 0
     """Environment steps after those of Q-learning, in whole rollouts; 0 leaves this part out."""
-    num_envs: int = 128
+    num_envs: Positive = 128
     """Worlds stepped at once."""
-    rollout: int = 30
+    rollout: Positive = 30
     """Steps of every world between two updates of the policy; 30 is an episode."""
-    epochs: int = 4
+    epochs: Positive = 4
     """Passes over each rollout."""
-    batch_size: int = 512
+    batch_size: Annotated[int, Bounds(2)] = 512
     """Transitions in a minibatch."""
-    temperature: float = 0.1
+    temperature: AboveZero = 0.1
     """T of the policy that drives, softmax(Q / T); the greedy policy is what is measured."""
-    discount: float = 1.0
+    discount: Share = 1.0
     """gamma. What is measured is the plain sum of rewards, and the critic knows when it ends."""
-    trace: float = 0.95
+    trace: Share = 0.95
     """lambda of generalised advantage estimation."""
-    clip: float = 0.2
+    clip: AboveZero = 0.2
     """How far the probability of an action may move from what it was when it was taken, as a share."""
-    crash_penalty: float = 2.0
+    crash_penalty: Amount = 2.0
     """What a crash costs more while learning than in the return. In the last second it costs next to nothing there."""
-    critic_steps: int = 38_400
+    critic_steps: Count = 38_400
     """Of the steps, the first ones, in which the critic alone learns."""
-    learning_rate: float = 3e-4
+    learning_rate: AboveZero = 3e-4
     """Adam's step size for the policy; falls linearly to zero."""
-    critic_rate: float = 1e-3
+    critic_rate: AboveZero = 1e-3
     """Adam's step size for the critic."""
-    max_grad_norm: float = 0.5
+    max_grad_norm: AboveZero = 0.5
     """The policy's gradients are clipped to this norm."""
-    critic_max_grad_norm: float = 1.0
+    critic_max_grad_norm: AboveZero = 1.0
     """The critic's gradients are clipped to this norm."""
 
 
@@ -291,39 +284,39 @@ class PpoConfig:
 class AdaptConfig:
     """Phase 3: online adaptation (paper: section 4.4)."""
 
-    steps: int = 10_000
+    steps: Count = 10_000
     """Environment steps of Q-learning, all worlds together; 0 leaves it out."""
-    num_envs: int = 10
+    num_envs: Positive = 10
     """Worlds stepped at once; 1 is the paper's setting."""
-    updates_per_step: float = 0.2
+    updates_per_step: AboveZero = 0.2
     """Gradient steps per environment step."""
     scenario: str = ""
     """Target scenario; empty is the one that the agent was distilled in."""
-    buffer_size: int = 100_000
+    buffer_size: Positive = 100_000
     """Capacity of the replay buffer."""
-    learning_starts: int = 500
+    learning_starts: Count = 500
     """Environment steps before the first gradient step."""
-    exploration_start: float = 0.1
+    exploration_start: Share = 0.1
     """epsilon of epsilon-greedy at the first step; the paper's 1 forgets for a while what was distilled."""
-    exploration_end: float = 0.02
+    exploration_end: Share = 0.02
     """epsilon after the schedule."""
-    exploration_share: float = 0.2
+    exploration_share: Share = 0.2
     """Share of the steps over which epsilon falls."""
-    exploration_hold: int = 1
+    exploration_hold: Positive = 1
     """A random action is held for 1 to so many steps, and begun so rarely that epsilon stays the share of steps that
     explore; 1 is plain epsilon-greedy."""
-    offline_share: float = 0.5
+    offline_share: ShareBelowOne = 0.5
     """Share of each batch taken from the offline data; whatever `loss.n_step`, over one step."""
     train: Literal["adapter", "all", "scratch"] = "adapter"
     """`adapter` is the method: policy 1 frozen. `all` fine-tunes every weight. `scratch` starts from new weights."""
     freeze_decoder: bool = False
     """Also freeze the action decoder."""
-    vehicles: int = 0
+    vehicles: Annotated[int, Bounds(0, MAX_VEHICLES)] = 0
     """Set `network.vehicles` from this phase on, whatever the data has, to see farther; 0 leaves it as it is. At least
     what it was, for a network of tokens that masks absent rows and has no position learned for each."""
     mirror: bool = False
     """Set `network.mirror` from this phase on; without this an agent keeps what it has."""
-    evaluate_every: int = 1_000
+    evaluate_every: Count = 1_000
     """Environment steps between two evaluations; 0 is never."""
     loss: LossConfig = field(default_factory=lambda: LossConfig(conservative_weight=0.2, robust_weight=0.0, n_step=3))
     """The loss of this phase. A little of the conservative term keeps values that were learned offline from being
@@ -338,13 +331,13 @@ class AdaptConfig:
 class EvaluateConfig:
     """Measuring: spawns and attacks (paper: section 4.5)."""
 
-    spawns: int = 200
+    spawns: Positive = 200
     """Episodes, one for each of the first spawn seeds of the set `test`."""
-    teacher_spawns: int = 16
+    teacher_spawns: Count = 16
     """Episodes of the teacher, which is slow; the first of the same seeds. 0 leaves the row out."""
-    planner_spawns: int = 200
+    planner_spawns: Count = 200
     """Episodes of a planner, which takes seconds for each; the first of the same seeds. 0: a run has no such row."""
-    curve_spawns: int = 20
+    curve_spawns: Count = 20
     """Episodes of each point of a learning curve, from the set `tune`."""
     attacks: tuple[str, ...] = ("none", "uniform", "gaussian", "fgsm", "pgd")
     """Attacks on the observations, by name."""
@@ -365,9 +358,9 @@ class Config:
     data: str = ""
     """Instead of collecting: `shipped` takes the datasets that come with the package, which needs no model; anything
     else is a directory that holds the datasets `teacher` and `random`."""
-    seed: int = 0
+    seed: Seed = 0
     """The seed from which every random stream is derived."""
-    threads: int = 1
+    threads: Positive = 1
     """Torch threads of this process; scale by processes instead."""
     device: str = "cpu"
     """Torch device."""
@@ -387,127 +380,6 @@ class Config:
     """Phase 3."""
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     """Measuring."""
-
-
-def preset(recipe: str = "strong", scale: str = "quick") -> Config:
-    """Return the settings of a recipe at a scale.
-
-    Raises:
-        RapidError: the recipe or the scale does not exist.
-    """
-    for kind, value, choices in (("recipe", recipe, RECIPES), ("scale", scale, SCALES)):
-        if value not in choices:
-            near = did_you_mean(value, choices)
-            raise RapidError(f"Unknown {kind} '{value}'{near} Choose one of {', '.join(choices)}.")
-    config = Config(recipe=typing.cast(Recipe, recipe), scale=typing.cast(Scale, scale))
-    if recipe == "paper":
-        config = _paper(config)
-    return _resize(config)
-
-
-def _paper(config: Config) -> Config:
-    """The numbers as printed (paper: hyperparameter table, sections 4.1 and 4.5)."""
-    robust = RobustConfig(norm="l2", radius=0.1, steps=10, step_size=0.01, random_start=False, attack_presence=True)
-    loss = LossConfig(discount=0.99, double=False, td_error="huber", robust_weight=0.5, robust_on="all", robust=robust)
-    optimizer = OptimizerConfig(linear_decay=False, batch_size=32, target_update=50, target_rate=1.0, max_grad_norm=0.0)
-    return replace(
-        config,
-        mix=MixConfig(p=0.25, size=15_000),
-        network=NetworkConfig(
-            width=64,
-            heads=2,
-            layers=2,
-            feedforward=128,
-            decoder_layers=2,
-            input="raw",
-            position="learned",
-            mask_absent=False,
-        ),
-        distill=DistillConfig(iterations=5_000, loss=loss, optimizer=optimizer),
-        adapt=AdaptConfig(
-            num_envs=1,
-            updates_per_step=1.0,
-            exploration_start=1.0,
-            exploration_end=0.05,
-            offline_share=0.0,
-            learning_starts=32,
-            loss=replace(loss, conservative_weight=0.0, robust_weight=0.0),
-            optimizer=optimizer,
-        ),
-    )
-
-
-def _resize(config: Config) -> Config:
-    """Apply the sizes of a scale; `full` keeps those of the recipe."""
-    if config.scale == "full":
-        return config
-    tiny, strong = config.scale == "tiny", config.recipe == "strong"
-    adapt = _boldly(config.adapt) if strong and not tiny else config.adapt
-    if config.scale == "long":
-        return replace(config, adapt=_at_length(adapt) if strong else replace(adapt, steps=LONG_STEPS))
-    teacher, random = (60, 180) if tiny else (2_000, 6_000)
-    return replace(
-        config,
-        collect=replace(
-            config.collect,
-            teacher_transitions=teacher,
-            random_transitions=random,
-            lockstep=4 if tiny else 16,
-        ),
-        mix=replace(config.mix, size=int(min(teacher / config.mix.p, random / (1 - config.mix.p)))),
-        distill=replace(config.distill, iterations=40 if tiny else 1_500, evaluate_every=20 if tiny else 300),
-        adapt=replace(
-            adapt,
-            # More than `full` has: driving is cheap here, and the paper's 10,000 add nothing to what was distilled.
-            steps=200 if tiny else 30_000 if strong else 8_000,
-            learning_starts=min(adapt.learning_starts, 50 if tiny else 500),
-            evaluate_every=100 if tiny else 2_000,
-        ),
-        evaluate=replace(
-            config.evaluate,
-            spawns=4 if tiny else 60,
-            teacher_spawns=2 if tiny else 12,
-            planner_spawns=2 if tiny else 12,
-            curve_spawns=2 if tiny else 20,
-        ),
-    )
-
-
-def _boldly(adapt: AdaptConfig) -> AdaptConfig:
-    """Return phase 3 for many steps: nothing holds the policy to the data any more, and it tries much."""
-    return replace(
-        adapt,
-        num_envs=20,
-        updates_per_step=0.3,
-        exploration_start=1.0,
-        exploration_end=0.05,
-        exploration_hold=5,
-        offline_share=0.0,
-        loss=replace(
-            adapt.loss,
-            conservative_weight=0.0,
-            td_error="huber",
-            munchausen_weight=0.9,
-            munchausen_temperature=0.02,
-        ),
-        optimizer=replace(adapt.optimizer, learning_rate=5e-4),
-    )
-
-
-def _at_length(adapt: AdaptConfig) -> AdaptConfig:
-    """Return phase 3 for so many steps that it can look further ahead and needs fewer gradient steps for each.
-
-    PPO then brings what it has found up to what is measured.
-    """
-    return replace(
-        adapt,
-        steps=LONG_STEPS,
-        buffer_size=LONG_STEPS,
-        updates_per_step=0.1,
-        exploration_share=0.3,
-        loss=replace(adapt.loss, discount=0.95),
-        ppo=replace(adapt.ppo, steps=LONG_PPO_STEPS),
-    )
 
 
 def without_place(config: Config) -> Config:

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import rapid
-from rapid.config import Config, PpoConfig, preset, without_place
+from rapid.config import Config, PpoConfig, without_place
 from rapid.config_io import apply_overrides, to_dict, to_toml
 from rapid.errors import RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
+from rapid.presets import preset
 
 FORMAT = 1
 STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from rapid.agents.open import open_agent
-from rapid.config import Config, TeacherConfig, preset
+from rapid.config import Config, TeacherConfig
 from rapid.config_io import apply_overrides, load_toml, to_dict, validate
 from rapid.data.journal import exclusive
 from rapid.errors import RapidError, did_you_mean
@@ -28,6 +28,7 @@ from rapid.evaluation.teacher_summary import (
 )
 from rapid.evaluation.teachers import SCHEMA, TeacherRow, drive_teacher, load_teacher_rows, save_teacher_rows
 from rapid.files import read_json, sha256, write_json, write_text
+from rapid.presets import preset
 from rapid.progress import task
 from rapid.report.figures import save_figure, teachers_figure
 from rapid.runs import commit, versions

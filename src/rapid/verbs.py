@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from tyro.conf import Positional, arg
 
+from rapid.bounds import Count, Positive, Seed, check_bounds
 from rapid.config import (
     RECIPES,
     SCALES,
@@ -25,11 +26,11 @@ from rapid.config import (
     Recipe,
     Scale,
     TeacherConfig,
-    preset,
     without_place,
 )
 from rapid.config_io import apply_overrides, load_toml, to_dict, validate
 from rapid.errors import RapidError
+from rapid.presets import preset
 from rapid.scenarios import PAPER_SCENARIOS, Reward, get_scenario
 from rapid.tracking import Tracking
 
@@ -83,7 +84,7 @@ class Collect:
     """Directory of the dataset."""
     scenario: str = Config.scenario
     """Where the teacher drives."""
-    seed: int = Config.seed
+    seed: Seed = Config.seed
     """Decides the random driver's actions; the traffic is fixed by the spawn seeds."""
     source: Flat[Source] = field(default_factory=Source)
 
@@ -111,7 +112,7 @@ class Mix:
     mix: Flat[MixConfig] = field(default_factory=MixConfig)
     out: str = "data/mixed"
     """Directory of the mixture."""
-    seed: int = Config.seed
+    seed: Seed = Config.seed
     """Decides which transitions are drawn."""
     source: Flat[Source] = field(default_factory=Source)
 
@@ -126,13 +127,13 @@ class Distill:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     out: str = "distilled"
     """Directory of the agent and its training record."""
-    curve_spawns: int = EvaluateConfig.curve_spawns
+    curve_spawns: Count = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
     tracking: Tracking = Config.tracking
     """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""
-    seed: int = Config.seed
+    seed: Seed = Config.seed
     """Decides the weights, the batches and the inner attack."""
-    seeds: int = 1
+    seeds: Positive = 1
     """Train this many agents, of the seeds from --seed on, into OUT/seed-N. Baselines (kind mlp, neither robust nor
     Munchausen term) train together as one stack in less than half the time, with one record for all in OUT/together;
     others one after another, where a process for each seed is faster."""
@@ -152,11 +153,11 @@ class Adapt:
     """Offline dataset: for --offline-share, which is 0 without it, and to measure what is forgotten."""
     out: str = "adapted"
     """Directory of the adapted agent and its training record."""
-    curve_spawns: int = EvaluateConfig.curve_spawns
+    curve_spawns: Count = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
     tracking: Tracking = Config.tracking
     """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""
-    seed: int = Config.seed
+    seed: Seed = Config.seed
     """Decides the traffic, the exploration and the batches."""
     device: str = Config.device
     """Torch device; on a CUDA device a gradient step of Q-learning is recorded once and replayed."""
@@ -177,7 +178,7 @@ class Evaluate:
     """The compiled twin, or highway-env itself."""
     out: str = "evaluation"
     """Directory of the episodes, the table and the plot."""
-    seed: int = Config.seed
+    seed: Seed = Config.seed
     """Decides the noise of attacks and the random driver; the traffic is fixed by the spawn seeds."""
     source: Flat[Source] = field(default_factory=Source)
 
@@ -195,17 +196,17 @@ class TeachBench:
     [teacher] section, for servers and recordings. The others are compared with the first."""
     scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = PAPER_SCENARIOS
     """Where they drive; by default the paper's three."""
-    spawns: int = 32
+    spawns: Positive = 32
     """Episodes of each teacher in each scenario."""
     spawn_set: Literal["tune", "test"] = "tune"
     """Where the spawn seeds come from: `tune` to choose a teacher, `test` to report one that was chosen elsewhere."""
-    lockstep: int = 64
+    lockstep: Positive = 64
     """Episodes driven side by side: a `local` model answers all of them together."""
     out: str = "teach-bench"
     """Directory of the rows, the table and the plot."""
     simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
     """The compiled twin, or highway-env itself."""
-    seed: int = Config.seed
+    seed: Seed = Config.seed
     """Decides the random drivers and the shuffled facts; the traffic is fixed by the spawn seeds."""
 
 
@@ -243,11 +244,11 @@ class Models:
 class VerifySimulator:
     """Hold the compiled simulator against the installed highway-env, step by step, and give a verdict."""
 
-    episodes: int = 12
+    episodes: Positive = 12
     """Episodes in all, shared among the scenarios."""
     scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = ()
     """Scenarios; by default the paper's with both dynamics, and others that reach the rest of the configuration."""
-    processes: int = 1
+    processes: Positive = 1
     """Processes that drive highway-env, which takes nearly all of the time."""
     plain_math: bool = True
     """Let NumPy use the C library's functions under highway-env, so that states can be compared to the last bit.
@@ -282,6 +283,7 @@ def call(verb: str, words: Sequence[str]) -> int:
         default=_defaults(kind, base),
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
+    check_bounds(options)
     return action(options, _with_options(base, options))
 
 
@@ -413,8 +415,6 @@ def _distill(options: Distill, config: Config) -> int:
     from rapid.phases.distill import distill_agent, distill_seeds
 
     check(config)
-    if options.seeds < 1:
-        raise RapidError(f"At least one agent must be trained; got --seeds {options.seeds}. Give 1 or more.")
     if options.seeds == 1:
         distill_agent(config, Path(options.dataset), Path(options.out))
         print(f"The agent is in {options.out}/agent")

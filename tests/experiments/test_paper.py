@@ -2,8 +2,8 @@
 
 import itertools
 
-from rapid.config import preset
 from rapid.experiments.paper import paper_numbers, paper_result
+from rapid.presets import preset
 from rapid.scenarios import PAPER_SCENARIOS, TARGET_SPEEDS, get_scenario
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")

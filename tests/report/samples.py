@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from rapid.config import preset
 from rapid.config_io import to_dict
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.evaluation.recording import Recording
+from rapid.presets import preset
 from rapid.report import ReportData, RoutingSnapshot
 
 SCENARIO = "lane-3-density-2"

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from rapid.agents.saved import load_agent, save_agent
-from rapid.config import Config, LossConfig, OptimizerConfig, preset
+from rapid.config import Config, LossConfig, OptimizerConfig
 from rapid.data.batch import with_rows
 from rapid.data.dataset import load_dataset, mix
 from rapid.data.replay import OfflineSampler
 from rapid.networks.q_network import build_network, set_phase, widened
+from rapid.presets import preset
 from rapid.training import offline
 from rapid.training.learner import Learner
 from rapid.training.machinery.capture import WARM_UP

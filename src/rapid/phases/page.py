@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rapid.agents.saved import load_agent
-from rapid.config import Config, preset
+from rapid.config import Config
 from rapid.config_io import apply_overrides, to_dict
 from rapid.data.dataset import load_dataset, summary
 from rapid.evaluation.metrics import load_rows
@@ -12,6 +12,7 @@ from rapid.evaluation.recording import Recording, load_recordings
 from rapid.files import read_json
 from rapid.phases.adapt import PPO
 from rapid.phases.data import data_folders
+from rapid.presets import preset
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.runs import STEPS
 from rapid.training.machinery.record import load_metrics
