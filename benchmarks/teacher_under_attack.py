@@ -20,7 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rapid.agents.open import open_agent
-from rapid.attacks import NoiseAttack, in_units
+from rapid.attacks import AttackSpec
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
@@ -41,17 +41,17 @@ TEACHER, FLOORS, LEARNED = "teacher", ("rule-forecast", "slower"), ("offline DQN
 COLORS = {TEACHER: "#a4490f", "offline DQN": "#1f6f8b", "distilled": "#6b57b8", "rule-forecast": "#3c8f4e"}
 
 
-def attacks(lanes: int) -> dict[str, NoiseAttack | None]:
+def attacks() -> dict[str, AttackSpec]:
     """Return every attack by name, none first."""
-    noises = [NoiseAttack(f"{kind}-{size:g}", kind, size, lanes, False) for kind in KINDS for size in SIZES]
-    return {"none": None} | {noise.name: noise for noise in noises}
+    noises = [AttackSpec(kind, radius=size, label=f"{kind}-{size:g}") for kind in KINDS for size in SIZES]
+    return {"none": AttackSpec()} | {noise.label: noise for noise in noises}
 
 
 def drive(agent: Any, name: str, training_seed: int | None, chosen: argparse.Namespace) -> list[EpisodeRow]:
     """Return one driver's rows, measuring those that are missing."""
-    lanes, seeds = get_scenario(chosen.scenario).lanes, spawn_seeds("test", chosen.spawns)
+    seeds = spawn_seeds("test", chosen.spawns)
     label = name if training_seed is None else f"{name}-{training_seed}"
-    cells = attacks(lanes)
+    cells = attacks()
     rows: list[EpisodeRow] = []
     with task(label, len(cells), "cells") as progress:
         for attack, noise in cells.items():
@@ -122,7 +122,7 @@ def report(rows: list[EpisodeRow], chosen: argparse.Namespace) -> str:
         lines += ["|---" * (2 + len(names)) + "|"]
         for size in (0.0, *SIZES):
             attack = f"{kind}-{size:g}" if size else "none"
-            cells = [in_units(size, lanes) if size else "0"]
+            cells = [AttackSpec("uniform", radius=size).units(lanes) if size else "0"]
             for name in names:
                 here = of(rows, name, attack)
                 cells.append(f"{shown(estimated(here, 'episode_return'))} ({column(here, 'crashed').mean():.2f})")

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from rapid.attacks import ATTACKS, get_attack
+from rapid.attacks import NAMED, get_attack
+from rapid.attacks.spec import with_options
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
@@ -16,7 +17,7 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-@pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.parametrize("name", NAMED)
 def test_every_attack_keeps_its_input_its_shape_and_unless_asked_presence(roads, name):
     obs, attack = roads(8), get_attack(name)
     before = obs.clone()
@@ -31,7 +32,10 @@ def test_every_attack_keeps_its_input_its_shape_and_unless_asked_presence(roads,
     if name != "none":
         # The exact gradient by presence is zero for a network that only asks whether it is above one half.
         open_network = build_network(NetworkConfig(kind="mlp", mask_absent=False), 3, 0)
-        assert (get_attack(name, attack_presence=True)(open_network, obs, generator())[..., 0] != obs[..., 0]).any()
+        assert (
+            get_attack(with_options(NAMED[name], "presence=free"))(open_network, obs, generator())[..., 0]
+            != obs[..., 0]
+        ).any()
 
 
 def test_noise_has_the_size_it_says(roads):
@@ -67,12 +71,34 @@ def test_the_lanes_of_the_road_can_be_given_so_that_every_agent_meets_the_same_a
         get_attack("uniform")(None, obs, generator())
 
 
-def test_sizes_are_told_in_metres():
-    assert get_attack("pgd").describe(5) == ("L∞ ball of radius 0.1 (20 m along, 2 m across, 8 m/s), 10 steps of 0.01")
-    assert get_attack("uniform", attack_presence=True).describe(3) == (
-        "uniform within ±0.2 (40 m along, 2.4 m across, 16 m/s), presence too"
-    )
-    assert [name for name in ATTACKS if get_attack(name).needs_gradient] == ["fgsm", "pgd"]
+def test_only_gradient_attacks_need_a_network():
+    assert [name for name in NAMED if get_attack(name).needs_gradient] == ["fgsm", "pgd"]
+
+
+def test_the_egos_own_row_stays_true_where_it_is_trusted(roads):
+    obs = roads(8)
+    for text in ("uniform:ego=trusted", "gaussian:ego=trusted", "fgsm:ego=trusted", "pgd:ego=trusted,steps=3"):
+        seen = get_attack(text)(NETWORK, obs, generator())
+        assert torch.equal(seen[:, 0], obs[:, 0])
+        assert not torch.equal(seen[:, 1:], obs[:, 1:])
+
+
+def test_a_box_in_metres_is_a_box_in_metres(roads):
+    obs = roads(64)
+    for text in ("uniform:metres=1,speed=0.5", "pgd:metres=1,speed=0.5,steps=3,restarts=3"):
+        moved = (get_attack(text)(NETWORK, obs, generator()) - obs).abs().amax((0, 1))
+        assert (moved <= torch.tensor([0, 1, 1, 0.5, 0.5]) + 1e-4).all()
+        assert (moved[1:] > torch.tensor([0.9, 0.9, 0.45, 0.45])).all()
+
+
+@pytest.mark.parametrize("text", ["uniform", "gaussian", "pgd:start=random,steps=2,restarts=4", "pgd:norm=l2,steps=2"])
+def test_what_is_drawn_for_an_observation_does_not_depend_on_its_company(roads, text):
+    obs, attack = roads(6), get_attack(text)
+    sources = [torch.Generator().manual_seed(seed) for seed in range(6)]
+    together = attack(NETWORK, obs, sources)
+    for i in (5, 2):
+        alone = attack(NETWORK, obs[i : i + 1], [torch.Generator().manual_seed(i)])
+        assert torch.allclose(alone[0], together[i], atol=1e-3)
 
 
 def test_mistakes_are_explained(roads):

@@ -1,5 +1,6 @@
 """Rollouts: finished worlds count no further, the true observation is measured, noise is each episode's own."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import torch
 
 import rapid
 from rapid.agents.open import kind_of, open_agent
+from rapid.attacks.draws import uniform
 from rapid.errors import RapidError
 from rapid.evaluation import rollouts
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
@@ -27,8 +29,8 @@ class Noise:
     needs_gradient: bool = False
     name: str = "noise"
 
-    def __call__(self, network: Any, obs_BVF: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        return obs_BVF + torch.rand(obs_BVF.shape, generator=generator)
+    def __call__(self, network: Any, obs_BVF: torch.Tensor, source: Sequence[torch.Generator]) -> torch.Tensor:
+        return obs_BVF + uniform(obs_BVF.shape, source)
 
 
 class Watcher:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import rapid
 from rapid.agents.open import check_road, driver_for, kind_of
+from rapid.attacks.spec import AttackSpec, parse_attack
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, Kind
 from rapid.evaluation.recording import Recording
@@ -85,7 +86,7 @@ class Episodes:
         ]
 
 
-def is_applicable(agent: Any, attack: AttackLike | str | None) -> bool:
+def is_applicable(agent: Any, attack: AttackLike | AttackSpec | str | None) -> bool:
     """Whether the attack can be made on the agent.
 
     A gradient attack needs the agent's network; and an agent that reads the worlds themselves sees no observation.
@@ -100,7 +101,7 @@ def run_episodes(
     agent: Any,
     scenario: str,
     seeds: Sequence[int],
-    attack: AttackLike | str | None = None,
+    attack: AttackLike | AttackSpec | str | None = None,
     generator_seed: int = 0,
     record: bool = False,
     simulator: Simulator = "compiled",
@@ -109,10 +110,9 @@ def run_episodes(
     """Drive one episode for each spawn seed and return what was measured.
 
     `agent` has ``act(obs_BVF) -> actions``, or is a teacher with ``decide``, or needs the worlds themselves and has
-    ``bind(env) -> agent``; one that reads other than 15 vehicles has ``vehicles``. `attack` is an attack or its name.
-    `progress` is called with the number of episodes that have just ended. The noise of an episode depends on
-    `generator_seed`, its spawn seed and the step, not on the episodes beside it; only a gradient attack with a random
-    start draws for all worlds of a step together.
+    ``bind(env) -> agent``; one that reads other than 15 vehicles has ``vehicles``. `attack` is an attack, its spec or
+    its text. `progress` is called with the number of episodes that have just ended. What an attack draws in an episode
+    depends on `generator_seed`, its spawn seed and the step, not on the episodes beside it.
 
     Raises:
         RapidError: no seeds, an attack that cannot be made on the agent (see :func:`is_applicable`), or a road that the
@@ -175,7 +175,7 @@ def evaluate_agent(
     agent: Any,
     scenario: str,
     seeds: Sequence[int],
-    attacks: Iterable[str] = (NO_ATTACK,),
+    attacks: Iterable[str | AttackSpec] = (NO_ATTACK,),
     *,
     generator_seed: int = 0,
     training_seed: int | None = None,
@@ -205,12 +205,14 @@ def _network(agent: Any) -> torch.nn.Module | None:
     return network if isinstance(network, torch.nn.Module) else None
 
 
-def _resolve(attack: AttackLike | str | None, lanes: int) -> tuple[str, AttackLike | None]:
+def _resolve(attack: AttackLike | AttackSpec | str | None, lanes: int) -> tuple[str, AttackLike | None]:
     """Return the attack's name and the attack on a road with `lanes` lanes; None is no attack."""
-    if attack is None or attack == NO_ATTACK:
-        return NO_ATTACK, None
     if isinstance(attack, str):
-        from rapid.attacks import get_attack
+        attack = parse_attack(attack)
+    if attack is None or attack == AttackSpec():
+        return NO_ATTACK, None
+    if isinstance(attack, AttackSpec):
+        from rapid.attacks.registry import get_attack
 
-        return attack, get_attack(attack, lanes)
+        return attack.shown, get_attack(attack, lanes)
     return str(getattr(attack, "name", type(attack).__name__)), attack

@@ -1,7 +1,7 @@
 """Worlds under way side by side, and what is measured of them step by step."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -25,19 +25,18 @@ class AttackLike(Protocol):
         """Whether the agent's network is differentiated."""
         ...
 
-    def __call__(self, network: Any, obs_BVF: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Return what the agent sees instead."""
+    def __call__(self, network: Any, obs_BVF: torch.Tensor, source: Sequence[torch.Generator]) -> torch.Tensor:
+        """Return what the agent sees instead; what is drawn for observation i comes from generator i."""
         ...
 
 
 class Perturbation:
-    """An attack, the network it reads and one stream of noise per episode."""
+    """An attack, the network it reads and one random stream per episode, so that nothing depends on the batch."""
 
     def __init__(
         self, attack: AttackLike | None, network: torch.nn.Module | None, seed: int, spawns: NDArray[np.int64]
     ) -> None:
         self.attack, self.network = attack, network
-        self._batch = torch_stream(seed, "attack/batch")
         self._streams = [torch_stream(seed, f"attack/{spawn}") for spawn in spawns] if attack is not None else []
 
     def __call__(self, obs_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -45,11 +44,8 @@ class Perturbation:
             return obs_BVF
         obs = torch.from_numpy(np.ascontiguousarray(obs_BVF))
         if self.attack.needs_gradient and self.network is not None:
-            device = next(self.network.parameters()).device
-            seen = self.attack(self.network, obs.to(device), self._batch)
-        else:
-            each = [self.attack(self.network, obs[i : i + 1], self._streams[world]) for i, world in enumerate(worlds)]
-            seen = torch.cat(each)
+            obs = obs.to(next(self.network.parameters()).device)
+        seen = self.attack(self.network, obs, [self._streams[world] for world in worlds])
         return seen.detach().cpu().numpy().astype(np.float32, copy=False)
 
 

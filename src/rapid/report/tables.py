@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+from rapid.attacks.spec import parse_attack
 from rapid.evaluation.statistics import Estimate
 from rapid.evaluation.summary import KINDS, NOT_APPLICABLE, NOT_RUN, AttackCell, SummaryRow, number, units
 from rapid.experiments.paper import PaperResult
@@ -81,9 +82,7 @@ def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
 
 def attack_sentences(attacks: Sequence[str], scenario: Scenario) -> list[str]:
     """Return what each attack may do, in metres and m/s."""
-    from rapid.attacks import ATTACKS, get_attack
-
-    return [f"{name}: {get_attack(name).describe(scenario.lanes)}" for name in attacks if name in ATTACKS]
+    return [f"{name}: {parse_attack(name).describe(scenario.lanes)}" for name in attacks]
 
 
 def caption(rows: Sequence[SummaryRow]) -> Markup:
