@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 
 from rapid.attacks.spec import parse_attack
+from rapid.errors import RapidError
 from rapid.evaluation.statistics import Estimate
 from rapid.evaluation.summary import KINDS, NOT_APPLICABLE, NOT_RUN, AttackCell, SummaryRow, number, units
 from rapid.experiments.paper import PaperResult
@@ -82,7 +84,11 @@ def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
 
 def attack_sentences(attacks: Sequence[str], scenario: Scenario) -> list[str]:
     """Return what each attack may do, in metres and m/s."""
-    return [f"{name}: {parse_attack(name).describe(scenario.lanes)}" for name in attacks]
+    sentences: list[str] = []
+    for name in attacks:
+        with suppress(RapidError):  # rows may carry a label that is no text of an attack
+            sentences.append(f"{name}: {parse_attack(name).describe(scenario.lanes)}")
+    return sentences
 
 
 def caption(rows: Sequence[SummaryRow]) -> Markup:
