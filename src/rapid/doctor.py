@@ -69,7 +69,12 @@ def _simulator() -> Finding:
     import numpy as np
 
     import rapid
+    from rapid.simulator.compile import damaged_cache_files
+    from rapid.simulator.step import step_worlds
 
+    cache = getattr(step_worlds, "_cache", None)  # none where no directory can be written
+    folder = getattr(cache, "cache_path", None)
+    damaged = damaged_cache_files(folder) if folder else []
     start = time.perf_counter()
     env = rapid.make_vec("lane-3-density-2", 64, seed=0)
     env.reset(seed=0)
@@ -82,6 +87,10 @@ def _simulator() -> Finding:
         steps += 64
     speed = steps / (time.perf_counter() - start)
     fact = f"{speed:,.0f} decisions/s at 64 worlds, first step after {first:.1f} s"
+    if damaged:
+        fact += f"; {len(damaged)} damaged file{'s' * (len(damaged) > 1)} of machine code in {folder}"
+        fix = "Each is compiled anew as soon as it is needed. If it happens again, look at the disk."
+        return Finding("simulator", "warning", fact, fix)
     if speed < 500:
         return Finding(
             "simulator", "warning", fact, "Is the machine busy? Expected some thousands a second on one core."

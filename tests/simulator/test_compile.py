@@ -50,6 +50,85 @@ def test_where_nothing_can_be_written_kernels_still_run(tmp_path: Path, monkeypa
     assert _load(tmp_path)(21) == 42
 
 
+def _zeros(path: Path) -> None:
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def _wrong_byte(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def _unreadable(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path)  # permissions do not stop root, a link to itself does
+
+
+@pytest.mark.parametrize("file", ["*.nbi", "*.nbc"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+        _zeros,
+        _wrong_byte,
+        _unreadable,
+    ],
+    ids=["empty", "half", "zeros", "wrong byte", "unreadable"],
+)
+def test_a_damaged_cache_is_noticed_told_and_compiled_anew(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, file: str, damage: Any
+) -> None:
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiling, "_troubles", [])
+    assert _load(tmp_path)(21) == 42
+    (stored,) = (tmp_path / "cache").rglob(file)
+    damage(stored)
+    assert compiling.damaged_cache_files(stored.parent) == [stored.name]
+    capsys.readouterr()
+    assert _load(tmp_path)(21) == 42
+    told = capsys.readouterr().err
+    assert told.count("compiled anew") == 1
+    assert str(stored.parent) in told
+    assert stored.name in told
+    assert compiling.damaged_cache_files(stored.parent) == []
+    again = _load(tmp_path)
+    assert again(21) == 42
+    assert again.stats.cache_hits
+    assert capsys.readouterr().err == ""
+
+
+def test_a_full_disk_does_not_stop_a_kernel(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiling, "_troubles", [])
+    monkeypatch.setattr(compiling._CheckedCacheFile, "_write", full)
+    assert _load(tmp_path)(21) == 42
+    assert "No space left" in capsys.readouterr().err
+
+
+def test_doctor_names_damaged_machine_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from rapid import doctor
+    from rapid.simulator import step
+
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
+    double = _load(tmp_path)
+    assert double(21) == 42
+    (stored,) = (tmp_path / "cache").rglob("*.nbc")
+    monkeypatch.setattr(step.step_worlds._cache, "_cache_path", str(stored.parent))  # type: ignore[attr-defined]
+    assert "damaged" not in doctor._simulator().fact
+    _zeros(stored)
+    found = doctor._simulator()
+    assert found.verdict == "warning"
+    assert "1 damaged file of machine code" in found.fact
+    assert str(stored.parent) in found.fact
+
+
 def test_a_change_of_any_kernel_makes_all_cached_kernels_stale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = Path(compiling.__file__).parents[1]
     for path in package.rglob("*.py"):

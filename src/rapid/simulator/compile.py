@@ -3,6 +3,8 @@
 """How the kernels of this package are compiled: one thread, IEEE arithmetic, and a cache that is never stale."""
 
 import hashlib
+import pickle
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba import types
+from numba.core.caching import IndexDataCacheFile
 from numba.extending import intrinsic
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -24,6 +27,101 @@ def kernel_stamp() -> bytes:
         if b"@kernel" in source:
             digest.update(path.name.encode() + b"\0" + source)
     return digest.digest()
+
+
+_DIGEST = hashlib.sha256().digest_size
+_MARK = "-checked"
+"""In the name of every file of the cache that ends with its digest; numba's own files have none."""
+_troubles: list[str] = []
+
+
+class _CheckedCacheFile(IndexDataCacheFile):
+    """Numba's cache of one function, but a file that is damaged or unreadable counts as absent.
+
+    Numba unpickles whatever it finds, so an empty or torn file is a traceback in every command, and one with a wrong
+    byte in the machine code a crash of the process. Here each file ends with the SHA-256 of what stands before it.
+    """
+
+    def __init__(self, original: IndexDataCacheFile) -> None:
+        index: str = original._index_name
+        super().__init__(original._cache_path, index.removesuffix(".nbi") + _MARK, kernel_stamp())
+
+    def load(self, key: Any) -> Any:
+        """Return the machine code stored under `key`, or None if there is none that can be used."""
+        return self._guarded(lambda: IndexDataCacheFile.load(self, key), None)
+
+    def save(self, key: Any, data: Any) -> None:
+        """Store machine code; where the disk does not take it, it is compiled again by the next process."""
+        self._guarded(lambda: IndexDataCacheFile.save(self, key, data), None)
+
+    def _load_index(self) -> dict[Any, Any]:
+        def read() -> dict[Any, Any]:
+            content = _checked_content(Path(self._index_path))
+            if content is None:
+                return {}
+            version, stamp, overloads = pickle.loads(content)
+            return overloads if (version, stamp) == (self._version, self._source_stamp) else {}
+
+        return self._guarded(read, {})
+
+    def _save_index(self, overloads: dict[Any, Any]) -> None:
+        self._write(self._index_path, self._dump((self._version, self._source_stamp, overloads)))
+
+    def _load_data(self, name: str) -> Any:
+        content = _checked_content(Path(self._data_path(name)))
+        return None if content is None else pickle.loads(content)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._write(self._data_path(name), self._dump(data))
+
+    def _write(self, path: str, content: bytes) -> None:
+        with self._open_for_write(path) as file:
+            file.write(content + hashlib.sha256(content).digest())
+
+    def _guarded(self, work: Callable[[], Any], otherwise: Any) -> Any:
+        try:
+            return work()
+        except (OSError, _DamagedError) as error:
+            if not _troubles:
+                print(
+                    f"rapid: machine code of the simulator in '{self._cache_path}' cannot be used ({error}). What "
+                    "is needed of it is compiled anew, which takes up to half a minute.",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            _troubles.append(str(error))
+            return otherwise
+
+
+class _DamagedError(Exception):
+    """A file of the cache is not what was written."""
+
+
+def _checked_content(path: Path) -> bytes | None:
+    """Return what was written to a file of the cache, None if there is no such file."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise _DamagedError(f"{path.name} cannot be read: {error.strerror}") from error
+    if len(content) < _DIGEST or hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
+        raise _DamagedError(f"{path.name} is damaged")
+    return content[:-_DIGEST]
+
+
+def damaged_cache_files(folder: str | Path) -> list[str]:
+    """Return the names of the cached kernels in a folder that are damaged or cannot be read.
+
+    Each is compiled anew as soon as it is needed.
+    """
+    damaged: list[str] = []
+    for path in sorted(Path(folder).glob(f"*{_MARK}.*nb[ci]")):
+        try:
+            _checked_content(path)
+        except _DamagedError:
+            damaged.append(path.name)
+    return damaged
 
 
 def kernel(function: Function) -> Function:
@@ -41,9 +139,9 @@ def kernel(function: Function) -> Function:
         dispatcher: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no directory can be written: numba finds no place for the cache
         return cast(Function, numba.njit(**options)(function))
-    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if cache_file is not None:
-        cache_file._source_stamp = kernel_stamp()
+    stored = getattr(dispatcher, "_cache", None)
+    if isinstance(getattr(stored, "_cache_file", None), IndexDataCacheFile):
+        stored._cache_file = _CheckedCacheFile(stored._cache_file)
     return cast(Function, dispatcher)
 
 
