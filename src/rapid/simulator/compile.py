@@ -139,7 +139,7 @@ def kernel(function: Function) -> Function:
         dispatcher: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no directory can be written: numba finds no place for the cache
         return cast(Function, numba.njit(**options)(function))
-    stored = getattr(dispatcher, "_cache", None)
+    stored: Any = getattr(dispatcher, "_cache", None)
     if isinstance(getattr(stored, "_cache_file", None), IndexDataCacheFile):
         stored._cache_file = _CheckedCacheFile(stored._cache_file)
     return cast(Function, dispatcher)
