@@ -45,8 +45,7 @@ from rapid.losses import q_loss
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.networks.stack import stack_networks
 from rapid.phases.data import collect_transitions
-from rapid.phases.distill import baseline
-from rapid.presets import preset
+from rapid.presets import offline_baseline, preset
 from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import get_scenario
@@ -62,7 +61,7 @@ NETWORK: NetworkConfig = replace(PAPER.network, kind="mlp")
 
 def settings(kind: str, iterations: int = 1) -> DistillConfig:
     """Return our settings of a baseline: recipe `paper`, without the robust term."""
-    return replace(baseline(PAPER, kind).distill, iterations=iterations, evaluate_every=0)
+    return replace(offline_baseline(PAPER, kind).distill, iterations=iterations, evaluate_every=0)
 
 
 def their_settings(kind: str) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def kinds() -> dict[str, tuple[Config, str]]:
         "strong, no PGD": (calm, "distill"),
         "strong, PGD-5 on the teacher's half": (strong, "distill"),
         "paper, PGD-10 on all": (paper, "distill"),
-        "strong, adapting, gate open": (preset("strong", "long"), "adapt"),
+        "strong, adapting, gate open": (preset("strong", "full", "ppo"), "adapt"),
     }
 
 

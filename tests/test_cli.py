@@ -47,7 +47,7 @@ def test_verbs_without_options_run(capsys: pytest.CaptureFixture[str]):
     [
         (["rnu"], "did you mean 'run'"),
         (["run", "--recipe", "papr"], "did you mean 'paper'"),
-        (["run", "--scale", "huge"], "tiny, quick, full, long"),
+        (["run", "--scale", "huge"], "tiny, quick, full."),
         (["run", "--scenario", "lane-3-densty-2"], "did you mean 'lane-3-density-2'"),
         (["run", "--seed", "x"], "seed"),
         (["run", "--distill.loss.discont", "1"], "discount"),

@@ -10,11 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rapid import config as settings
+from rapid import presets
 from rapid.bounds import Bounds, numbers
 from rapid.config import Config
 from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate
 from rapid.errors import RapidError
 from rapid.presets import preset
+from rapid.verbs import _base_settings
 
 PRESETS = [(recipe, scale) for recipe in settings.RECIPES for scale in settings.SCALES]
 
@@ -58,16 +60,49 @@ def test_the_paper_recipe_is_the_printed_one():
     assert (paper.adapt.exploration_start, paper.adapt.exploration_end, paper.adapt.buffer_size) == (1, 0.05, 100_000)
 
 
-def test_long_adaptation_differs_in_phase_3_alone_and_the_paper_stays_as_printed():
-    for recipe in settings.RECIPES:
-        full, long = preset(recipe, "full"), preset(recipe, "long")
-        assert dataclasses.replace(long, scale="full", adapt=full.adapt) == full
-        assert long.adapt.steps == 30 * full.adapt.steps
-    assert preset("paper", "long").adapt == dataclasses.replace(preset("paper", "full").adapt, steps=300_000)
-    strong = preset("strong", "long").adapt
-    assert (strong.offline_share, strong.loss.conservative_weight, strong.exploration_hold) == (0, 0, 5)
-    assert strong.ppo.steps > 0
-    assert preset("paper", "long").adapt.ppo.steps == preset("strong", "full").adapt.ppo.steps == 0
+def test_a_scale_changes_sizes_only():
+    sizes = {
+        *("scale", "mix.size", "distill.iterations", "distill.evaluate_every", "adapt.steps", "adapt.ppo.steps"),
+        *("adapt.ppo.critic_steps", "adapt.buffer_size", "adapt.learning_starts", "adapt.evaluate_every"),
+        *("collect.teacher_transitions", "collect.random_transitions", "collect.lockstep"),
+        *(f"evaluate.{name}spawns" for name in ("", "teacher_", "planner_", "curve_")),
+    }
+    for recipe, plans in presets.OF_RECIPE.items():
+        for plan in plans:
+            full = preset(recipe, "full", plan)
+            for scale in settings.SCALES:
+                assert set(presets.differences(full, preset(recipe, scale, plan))) <= sizes
+
+
+def test_a_plan_changes_phase_3_only():
+    for plan in presets.OF_RECIPE["strong"]:
+        changed = presets.differences(preset("strong", "full", "careful"), preset("strong", "full", plan))
+        assert all(name == "plan" or name.startswith("adapt.") for name in changed)
+
+
+def test_presets_that_do_not_exist_are_named():
+    with pytest.raises(RapidError, match=r"--scale full --plan ppo"):
+        preset("strong", "long")
+    with pytest.raises(RapidError, match=r"did you mean 'careful'"):
+        preset("strong", "full", "carefull")
+    with pytest.raises(RapidError, match=r"has no plan 'ppo'"):
+        preset("paper", "full", "ppo")
+
+
+def test_files_from_before_there_were_plans_mean_what_they_did():
+    assert presets.of_file({"recipe": "strong", "scale": "long"}).plan == "ppo"
+    assert presets.of_file({"recipe": "strong", "scale": "full"}).plan == "careful"
+    assert presets.of_file({"recipe": "paper", "scale": "long"}).plan == "printed"
+    assert presets.of_file({"recipe": "strong", "scale": "quick"}).plan == "bold"
+
+
+def test_a_file_that_contradicts_an_option_is_told(tmp_path: Path):
+    file = tmp_path / "old.toml"
+    file.write_text(to_toml(to_dict(preset("strong", "quick"))))
+    with pytest.raises(RapidError, match=r"of the scale 'quick', and --scale says 'tiny'"):
+        _base_settings(["--config", str(file), "--scale", "tiny"])
+    file.write_text("[mix]\nsize = 50\n")
+    assert _base_settings(["--config", str(file), "--scale", "tiny"]).mix.size == 50
 
 
 def test_every_field_has_a_docstring():

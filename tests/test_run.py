@@ -25,10 +25,10 @@ from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.q_network import build_network
 from rapid.phases.adapt import adapt_agent
-from rapid.phases.distill import baseline, distill_agent, distill_seeds
+from rapid.phases.distill import distill_agent, distill_seeds
 from rapid.phases.measure import compare
 from rapid.phases.page import report_again
-from rapid.presets import preset
+from rapid.presets import offline_baseline, preset
 from rapid.run import run
 from rapid.runs import STEPS
 from rapid.scenarios import SLOWER
@@ -89,7 +89,7 @@ def test_a_run_leaves_agents_rows_and_a_page(finished: Path):
 def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, kind):
     config = preset("strong", "tiny")
     if kind == "mlp":
-        config = baseline(config, "cql")
+        config = offline_baseline(config, "cql")
     small = replace(config.distill, iterations=4, evaluate_every=2)
     config = replace(config, distill=small, evaluate=replace(config.evaluate, curve_spawns=1))
     homes = distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2))
@@ -104,7 +104,7 @@ def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, ki
     # The same command does nothing again; other ways of training do not write over it.
     before = [(home / "agent" / "weights.safetensors").read_bytes() for home in homes]
     assert distill_seeds(config, finished / "mix", tmp_path / "all", (1, 2)) == homes
-    other = preset("strong", "tiny") if kind == "mlp" else baseline(preset("strong", "tiny"), "cql")
+    other = preset("strong", "tiny") if kind == "mlp" else offline_baseline(preset("strong", "tiny"), "cql")
     with pytest.raises(RapidError, match="Choose another --out"):
         distill_seeds(other, finished / "mix", tmp_path / "all", (1, 2))
     assert [(home / "agent" / "weights.safetensors").read_bytes() for home in homes] == before
@@ -335,13 +335,13 @@ def test_baselines_have_the_papers_printed_sizes_in_its_recipe():
     def sizes(recipe: str) -> dict[str, tuple[float, int, int]]:
         found = {}
         for name in ("dqn", "ddqn", "cql"):
-            optimizer = baseline(preset(recipe, "full"), name).distill.optimizer
+            optimizer = offline_baseline(preset(recipe, "full"), name).distill.optimizer
             found[name] = (optimizer.learning_rate, optimizer.batch_size, optimizer.target_update)
         return found
 
     assert sizes("paper") == {"dqn": (5e-3, 32, 50), "ddqn": (5e-4, 32, 50), "cql": (5e-4, 64, 50)}
     assert len(set(sizes("strong").values())) == 1
-    terms = {name: baseline(preset("paper"), name).distill.loss for name in ("dqn", "ddqn", "cql", "bc")}
+    terms = {name: offline_baseline(preset("paper"), name).distill.loss for name in ("dqn", "ddqn", "cql", "bc")}
     assert {name for name, loss in terms.items() if loss.conservative_weight} == {"cql"}
     assert {name for name, loss in terms.items() if loss.double} == {"ddqn", "cql"}
     assert not any(loss.robust_weight for loss in terms.values())

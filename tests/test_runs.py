@@ -52,7 +52,7 @@ def test_where_it_runs_may_change_and_settings_may_be_added(tmp_path: Path):
 
 
 def test_a_long_run_from_before_there_was_ppo_had_none(tmp_path: Path):
-    config = preset("strong", "long")
+    config = preset("strong", "full", "ppo")
     without = replace(config, adapt=replace(config.adapt, ppo=PpoConfig()))
     RunDirectory(tmp_path, without, STEPS)
     manifest = json.loads((tmp_path / "run.json").read_text())

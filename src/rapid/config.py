@@ -14,9 +14,11 @@ from rapid.bounds import AboveZero, Amount, Bounds, Count, Positive, Seed, Share
 from rapid.scenarios import MAX_VEHICLES, MIN_VEHICLES, NUM_VEHICLES
 
 Recipe = Literal["paper", "strong"]
-Scale = Literal["tiny", "quick", "full", "long"]
+Scale = Literal["tiny", "quick", "full"]
+Plan = Literal["printed", "careful", "bold", "ppo"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
+PLANS: tuple[str, ...] = typing.get_args(Plan)
 
 
 @dataclass(frozen=True)
@@ -268,6 +270,8 @@ class PpoConfig:
     """How far the probability of an action may move from what it was when it was taken, as a share."""
     crash_penalty: Amount = 2.0
     """What a crash costs more while learning than in the return. In the last second it costs next to nothing there."""
+    progress_crash_penalty: Amount = 5.0
+    """The same under the reward `progress`: where all speed is paid, 2 leaves more crashes than always-slower has."""
     critic_steps: Count = 38_400
     """Of the steps, the first ones, in which the critic alone learns."""
     learning_rate: AboveZero = 3e-4
@@ -351,6 +355,9 @@ class Config:
     """How things are trained."""
     scale: Scale = "quick"
     """How much is run."""
+    plan: Plan = "bold"
+    """How phase 3 learns: `printed` as the paper does; `careful` close to the data; `bold` by much exploring; `ppo` so
+    for longer, and then by PPO."""
     scenario: str = "lane-3-density-2"
     """Where the data is collected and policies are trained and measured."""
     simulator: Literal["compiled", "highway-env"] = "compiled"

@@ -23,6 +23,14 @@ def to_dict(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def flat(settings: dict[str, Any], where: str = "") -> dict[str, Any]:
+    """Return nested settings by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        found |= flat(value, f"{where}{name}.") if isinstance(value, dict) else {f"{where}{name}": value}
+    return found
+
+
 def apply_overrides(config: T, overrides: dict[str, Any], where: str = "", source: str = "the settings") -> T:
     """Return `config` with nested `overrides` applied, every key and type checked.
 

@@ -1,9 +1,17 @@
-"""Recipes and scales as data: how things are trained, and how much is run."""
+"""Recipes, scales and plans as data: how things are trained, and how much is run.
+
+A *recipe* says how things are trained: ``paper`` uses the numbers as printed, ``strong`` what a good practitioner
+would, for every method. A *plan* names the algorithm of phase 3 within a recipe. A *scale* changes sizes only:
+``tiny`` (CI), ``quick`` (a coffee), ``full`` (the paper's sizes or more).
+"""
 
 import typing
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any, Literal, NamedTuple
 
 from rapid.config import (
+    PLANS,
     RECIPES,
     SCALES,
     AdaptConfig,
@@ -13,32 +21,95 @@ from rapid.config import (
     MixConfig,
     NetworkConfig,
     OptimizerConfig,
+    Plan,
     Recipe,
     RobustConfig,
     Scale,
 )
+from rapid.config_io import flat, to_dict
 from rapid.errors import RapidError, did_you_mean
-
-LONG_STEPS = 300_000
-"""Online steps of Q-learning of the scale `long`."""
-LONG_PPO_STEPS = 700_000
-"""The steps by PPO after them, in the recipe `strong`."""
+from rapid.experiments.paper import paper_numbers
 
 
-def preset(recipe: str = "strong", scale: str = "quick") -> Config:
-    """Return the settings of a recipe at a scale.
+def differences(old: Config, new: Config) -> dict[str, tuple[Any, Any]]:
+    """Return the settings in which two trees differ, by dotted names, each with its value in both."""
+    before, after = flat(to_dict(old)), flat(to_dict(new))
+    return {name: (before[name], value) for name, value in after.items() if before[name] != value}
+
+
+class Sizes(NamedTuple):
+    """How much a scale runs, whatever the recipe and the plan; None leaves what the recipe has."""
+
+    teacher: int | None = None
+    random: int | None = None
+    lockstep: int = 16
+    iterations: int | None = None
+    evaluate_offline: int = 1_000
+    evaluate_online: int = 1_000
+    spawns: int = 200
+    teacher_spawns: int = 16
+    planner_spawns: int = 200
+    curve_spawns: int = 20
+
+
+SIZES: dict[Scale, Sizes] = {
+    "tiny": Sizes(60, 180, 4, 40, 20, 100, 4, 2, 2, 2),
+    "quick": Sizes(2_000, 6_000, 16, 1_500, 300, 2_000, 60, 12, 12, 20),
+    "full": Sizes(),
+}
+STEPS: dict[Plan, dict[Scale, tuple[int, int]]] = {
+    "printed": {"tiny": (200, 0), "quick": (8_000, 0), "full": (10_000, 0)},
+    "careful": {"tiny": (200, 0), "quick": (10_000, 0), "full": (10_000, 0)},
+    "bold": {"tiny": (200, 0), "quick": (30_000, 0), "full": (100_000, 0)},
+    "ppo": {"tiny": (200, 7_680), "quick": (30_000, 115_200), "full": (300_000, 700_000)},
+}
+"""Environment steps of phase 3, by Q-learning and then by PPO."""
+DEFAULT_PLAN: dict[Recipe, Plan] = {"paper": "printed", "strong": "bold"}
+OF_RECIPE: dict[Recipe, tuple[Plan, ...]] = {"paper": ("printed",), "strong": ("careful", "bold", "ppo")}
+
+
+def preset(recipe: str = "strong", scale: str = "quick", plan: str = "") -> Config:
+    """Return the settings of a recipe at a scale, phase 3 by a plan; without one by the recipe's usual.
 
     Raises:
-        RapidError: the recipe or the scale does not exist.
+        RapidError: the recipe, the scale or the plan does not exist, or the recipe has no such plan.
     """
-    for kind, value, choices in (("recipe", recipe, RECIPES), ("scale", scale, SCALES)):
-        if value not in choices:
+    if scale == "long":
+        raise RapidError("There is no scale 'long' any more. What it ran is now --scale full --plan ppo.")
+    for kind, value, choices in (("recipe", recipe, RECIPES), ("scale", scale, SCALES), ("plan", plan, PLANS)):
+        if value not in choices and (value or kind != "plan"):
             near = did_you_mean(value, choices)
             raise RapidError(f"Unknown {kind} '{value}'{near} Choose one of {', '.join(choices)}.")
-    config = Config(recipe=typing.cast(Recipe, recipe), scale=typing.cast(Scale, scale))
+    recipe, scale = typing.cast(Recipe, recipe), typing.cast(Scale, scale)
+    chosen = typing.cast(Plan, plan) or DEFAULT_PLAN[recipe]
+    if chosen not in OF_RECIPE[recipe]:
+        raise RapidError(
+            f"The recipe '{recipe}' has no plan '{chosen}'. It has: {', '.join(OF_RECIPE[recipe])}. Choose one of "
+            "them, or another --recipe."
+        )
+    config = Config(recipe=recipe, scale=scale, plan=chosen)
     if recipe == "paper":
         config = _paper(config)
-    return _resize(config)
+    return _resized(replace(config, adapt=_PLANS[chosen](config.adapt)))
+
+
+def of_file(settings: Mapping[str, Any]) -> Config:
+    """Return what a file of settings, such as a run's, changes: the preset of its recipe, scale and plan.
+
+    Files that were written before there were plans name none, or the scale `long`.
+    """
+    recipe, scale = str(settings.get("recipe", Config.recipe)), str(settings.get("scale", Config.scale))
+    plan = str(settings.get("plan", ""))
+    if scale == "long":
+        return replace(preset(recipe, "full", plan or ("ppo" if recipe == "strong" else "")))
+    if not plan and scale == "full" and recipe == "strong":
+        plan = "careful"
+    return preset(recipe, scale, plan)
+
+
+def without_presets(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a file's settings without the names that :func:`of_file` has used."""
+    return {name: value for name, value in settings.items() if name not in ("recipe", "scale", "plan")}
 
 
 def _paper(config: Config) -> Config:
@@ -73,38 +144,39 @@ def _paper(config: Config) -> Config:
     )
 
 
-def _resize(config: Config) -> Config:
-    """Apply the sizes of a scale; `full` keeps those of the recipe."""
-    if config.scale == "full":
-        return config
-    tiny, strong = config.scale == "tiny", config.recipe == "strong"
-    adapt = _boldly(config.adapt) if strong and not tiny else config.adapt
-    if config.scale == "long":
-        return replace(config, adapt=_at_length(adapt) if strong else replace(adapt, steps=LONG_STEPS))
-    teacher, random = (60, 180) if tiny else (2_000, 6_000)
+def _resized(config: Config) -> Config:
+    """Apply the sizes of the scale, and nothing else."""
+    sizes = SIZES[config.scale]
+    steps, ppo_steps = STEPS[config.plan][config.scale]
+    collect, mix, distill, adapt = config.collect, config.mix, config.distill, config.adapt
+    if sizes.teacher and sizes.random:
+        collect = replace(
+            collect, teacher_transitions=sizes.teacher, random_transitions=sizes.random, lockstep=sizes.lockstep
+        )
+        mix = replace(mix, size=int(min(sizes.teacher / mix.p, sizes.random / (1 - mix.p))))
+    if sizes.iterations:
+        distill = replace(distill, iterations=sizes.iterations)
+    tiny = config.scale == "tiny"
+    ppo = replace(adapt.ppo, steps=ppo_steps, critic_steps=3_840 if tiny else adapt.ppo.critic_steps)
     return replace(
         config,
-        collect=replace(
-            config.collect,
-            teacher_transitions=teacher,
-            random_transitions=random,
-            lockstep=4 if tiny else 16,
-        ),
-        mix=replace(config.mix, size=int(min(teacher / config.mix.p, random / (1 - config.mix.p)))),
-        distill=replace(config.distill, iterations=40 if tiny else 1_500, evaluate_every=20 if tiny else 300),
+        collect=collect,
+        mix=mix,
+        distill=replace(distill, evaluate_every=sizes.evaluate_offline),
         adapt=replace(
             adapt,
-            # More than `full` has: driving is cheap here, and the paper's 10,000 add nothing to what was distilled.
-            steps=200 if tiny else 30_000 if strong else 8_000,
-            learning_starts=min(adapt.learning_starts, 50 if tiny else 500),
-            evaluate_every=100 if tiny else 2_000,
+            steps=steps,
+            ppo=ppo,
+            buffer_size=max(adapt.buffer_size, steps),
+            learning_starts=min(adapt.learning_starts, 50) if tiny else adapt.learning_starts,
+            evaluate_every=sizes.evaluate_online,
         ),
         evaluate=replace(
             config.evaluate,
-            spawns=4 if tiny else 60,
-            teacher_spawns=2 if tiny else 12,
-            planner_spawns=2 if tiny else 12,
-            curve_spawns=2 if tiny else 20,
+            spawns=sizes.spawns,
+            teacher_spawns=sizes.teacher_spawns,
+            planner_spawns=sizes.planner_spawns,
+            curve_spawns=sizes.curve_spawns,
         ),
     )
 
@@ -130,17 +202,92 @@ def _boldly(adapt: AdaptConfig) -> AdaptConfig:
     )
 
 
-def _at_length(adapt: AdaptConfig) -> AdaptConfig:
+def _far_sighted(adapt: AdaptConfig) -> AdaptConfig:
     """Return phase 3 for so many steps that it can look further ahead and needs fewer gradient steps for each.
 
     PPO then brings what it has found up to what is measured.
     """
+    bold = _boldly(adapt)
     return replace(
-        adapt,
-        steps=LONG_STEPS,
-        buffer_size=LONG_STEPS,
+        bold,
         updates_per_step=0.1,
         exploration_share=0.3,
-        loss=replace(adapt.loss, discount=0.95),
-        ppo=replace(adapt.ppo, steps=LONG_PPO_STEPS),
+        loss=replace(bold.loss, discount=0.95),
+    )
+
+
+def _as_it_is(adapt: AdaptConfig) -> AdaptConfig:
+    return adapt
+
+
+_PLANS: dict[Plan, Callable[[AdaptConfig], AdaptConfig]] = {
+    "printed": _as_it_is,
+    "careful": _as_it_is,
+    "bold": _boldly,
+    "ppo": _far_sighted,
+}
+
+OfflineBaseline = Literal["dqn", "ddqn", "cql", "bc"]
+
+
+def offline_baseline(config: Config, algorithm: OfflineBaseline) -> Config:
+    """Return the settings of an MLP that learns offline by another algorithm.
+
+    They are those of RAPID but for what makes the algorithm; in the recipe `paper`, step size, batch and target updates
+    are what the paper's table prints for it. CQL builds on double DQN, as d3rlpy's does.
+    """
+    loss = replace(
+        config.distill.loss,
+        conservative_weight=1.0 if algorithm == "cql" else 0.0,
+        robust_weight=0.0,
+        double=algorithm in ("ddqn", "cql"),
+    )
+    optimizer = replace(config.distill.optimizer, algorithm="bc" if algorithm == "bc" else "dqn")
+    if config.recipe == "paper" and algorithm != "bc":
+        printed = paper_numbers()["hyperparameters"][algorithm]
+        optimizer = replace(
+            optimizer,
+            learning_rate=printed["learning_rate"],
+            batch_size=printed["batch_size"],
+            target_update=printed["target_update_interval"],
+        )
+    network = replace(config.network, kind="mlp")
+    return replace(config, network=network, distill=replace(config.distill, loss=loss, optimizer=optimizer))
+
+
+MLP_DISCOUNT = 0.93
+"""Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
+
+OnlineBaseline = Literal["dqn", "ddqn", "munchausen"]
+
+
+def online_baseline(config: Config, algorithm: OnlineBaseline) -> Config:
+    """Return the settings of an MLP that learns online from new weights, with as many steps as RAPID's phase 3.
+
+    In the recipe `paper` the DQN has the step size that the paper prints for it.
+    """
+    adapt = config.adapt
+    discount = adapt.loss.discount if config.recipe == "paper" else min(adapt.loss.discount, MLP_DISCOUNT)
+    loss = replace(
+        adapt.loss,
+        conservative_weight=0.0,
+        double=algorithm != "dqn",
+        munchausen_weight=adapt.loss.munchausen_weight if algorithm == "munchausen" else 0.0,
+        discount=discount,
+    )
+    rate = 5e-4
+    if config.recipe == "paper" and algorithm == "dqn":
+        rate = paper_numbers()["hyperparameters"]["dqn"]["learning_rate"]
+    return replace(
+        config,
+        network=replace(config.network, kind="mlp"),
+        adapt=replace(
+            adapt,
+            train="scratch",
+            exploration_start=1.0,
+            exploration_end=0.05,
+            offline_share=0.0,
+            loss=loss,
+            optimizer=replace(adapt.optimizer, learning_rate=rate),
+        ),
     )

@@ -16,9 +16,10 @@ from rapid.networks.q_network import check_widening
 from rapid.phases.adapt import adapt_agent
 from rapid.phases.checks import check
 from rapid.phases.data import collect_transitions, data_folders, given_data, mix_datasets
-from rapid.phases.distill import baseline, distill_agent
+from rapid.phases.distill import distill_agent
 from rapid.phases.measure import FLOORS, PLANNER, TEACHER, measure, why_no_teacher
 from rapid.phases.page import write_run_report
+from rapid.presets import offline_baseline
 from rapid.progress import format_seconds
 from rapid.runs import STEPS, RunDirectory, commit
 from rapid.scenarios import get_scenario
@@ -153,8 +154,8 @@ def _distill(config: Config, home: RunDirectory) -> dict[str, Any]:
     mixed = home.path / "mix"
     distill_agent(config, mixed, home.path / "distill" / "rapid", "distilled")
     # The two baselines that see the same data: what the method adds is the difference to them.
-    distill_agent(baseline(config, "dqn"), mixed, home.path / "distill" / "offline-dqn", "offline DQN")
-    distill_agent(baseline(config, "bc"), mixed, home.path / "distill" / "cloning", "behaviour cloning")
+    distill_agent(offline_baseline(config, "dqn"), mixed, home.path / "distill" / "offline-dqn", "offline DQN")
+    distill_agent(offline_baseline(config, "bc"), mixed, home.path / "distill" / "cloning", "behaviour cloning")
     return {}
 
 

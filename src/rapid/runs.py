@@ -22,7 +22,7 @@ from rapid.config import Config, PpoConfig, without_place
 from rapid.config_io import apply_overrides, to_dict, to_toml
 from rapid.errors import RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
-from rapid.presets import preset
+from rapid.presets import of_file, without_presets
 
 FORMAT = 1
 STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
@@ -112,10 +112,10 @@ class RunDirectory:
             )
         made = manifest["config"]
         # A setting that did not exist when the run was made had the effect that its default has now.
-        base = preset(made.get("recipe", config.recipe), made.get("scale", config.scale))
-        # The scale `long` had no PPO before there was any.
+        base = of_file(made)
+        # There was no PPO before a run's settings told of it.
         base = replace(base, adapt=replace(base.adapt, ppo=PpoConfig()))
-        there = apply_overrides(base, made, source=f"'{self.path / 'run.json'}'")
+        there = apply_overrides(base, without_presets(made), source=f"'{self.path / 'run.json'}'")
         changes = _differences(to_dict(without_place(there)), to_dict(without_place(config)))
         if changes:
             raise RapidError(

@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 
 from rapid.bounds import Count, Positive, Seed, check_bounds
 from rapid.config import (
+    PLANS,
     RECIPES,
     SCALES,
     AdaptConfig,
@@ -23,14 +24,15 @@ from rapid.config import (
     EvaluateConfig,
     MixConfig,
     NetworkConfig,
+    Plan,
     Recipe,
     Scale,
     TeacherConfig,
     without_place,
 )
-from rapid.config_io import apply_overrides, load_toml, to_dict, validate
+from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate
 from rapid.errors import RapidError
-from rapid.presets import preset
+from rapid.presets import DEFAULT_PLAN, OF_RECIPE, differences, of_file, preset, without_presets
 from rapid.scenarios import PAPER_SCENARIOS, Reward, get_scenario
 from rapid.tracking import Tracking
 
@@ -49,6 +51,8 @@ class Source:
     """Defaults of the settings."""
     scale: Scale = Config.scale
     """Defaults of the sizes."""
+    plan: Plan = Config.plan
+    """Defaults of phase 3."""
     file: SettingsFile = ""
     """Settings in a TOML file; options override it, it overrides recipe and scale."""
 
@@ -231,6 +235,16 @@ class Report:
 
 
 @dataclass(frozen=True)
+class Presets:
+    """Print what a recipe, a scale and a plan set; with a second one, only where the two differ."""
+
+    first: Annotated[Positional[str], arg(metavar="RECIPE[/SCALE[/PLAN]]")] = ""
+    """Such as strong, strong/full or strong/full/ppo; nothing lists what there is."""
+    second: Annotated[Positional[str], arg(metavar="RECIPE[/SCALE[/PLAN]]")] = ""
+    """What the first is compared with."""
+
+
+@dataclass(frozen=True)
 class Models:
     """List the embedded language models, fetch one, verify it, or remove it."""
 
@@ -288,20 +302,26 @@ def call(verb: str, words: Sequence[str]) -> int:
 
 
 def _base_settings(words: Sequence[str]) -> Config:
-    """The settings that recipe, scale and a settings file give, before the options."""
-    chosen = {name: _option(words, name) for name in ("recipe", "scale", "config")}
-    overrides = load_toml(chosen["config"]) if chosen["config"] else {}
-    source = f"'{chosen['config']}'"
-    recipe = chosen["recipe"] or str(overrides.get("recipe", Config.recipe))
-    scale = chosen["scale"] or str(overrides.get("scale", Config.scale))
+    """The settings that recipe, scale, plan and a settings file give, before the options.
+
+    Raises:
+        RapidError: an option names another recipe, scale or plan than the file, whose settings would contradict it.
+    """
+    file = _option(words, "config")
+    overrides = load_toml(file) if file else {}
+    choices = {"recipe": RECIPES, "scale": SCALES, "plan": PLANS}
+    asked = {name: value for name in choices if (value := _option(words, name))}
     if words and ("-h" in words or "--help" in words):
-        recipe, scale = (
-            (recipe if recipe in RECIPES else "strong"),
-            (scale if scale in SCALES else "quick"),
-        )
-    base = preset(recipe, scale)
-    overrides = {key: value for key, value in overrides.items() if key not in ("recipe", "scale")}
-    return apply_overrides(base, overrides, source=source)
+        asked = {name: value for name, value in asked.items() if value in choices[name]}
+    for name, value in asked.items():
+        if name in overrides and overrides[name] != value:
+            raise RapidError(
+                f"The settings file '{file}' is of the {name} '{overrides[name]}', and --{name} says '{value}'. Its "
+                f"other settings would stay, so what ran would be neither. Leave --{name} out, or the file."
+            )
+    named = any(name in overrides for name in choices)
+    base = of_file(overrides) if named else preset(**asked)
+    return apply_overrides(base, without_presets(overrides), source=f"'{file}'")
 
 
 def _option(words: Sequence[str], name: str) -> str:
@@ -321,7 +341,7 @@ def _defaults(kind: type[T], base: Config) -> T:
         if item.name == "settings":
             values[item.name] = base
         elif item.name == "source":
-            values[item.name] = Source(base.recipe, base.scale)
+            values[item.name] = Source(base.recipe, base.scale, base.plan)
         elif hasattr(base, item.name):
             values[item.name] = getattr(base, item.name)
         elif item.name == "curve_spawns":
@@ -346,8 +366,10 @@ def _with_options(base: Config, options: Any) -> Config:
 def _run(options: Run, config: Config) -> int:
     from rapid.run import run
 
-    name = f"{config.scenario}-{config.recipe}-{config.scale}-seed{config.seed}".replace(":", "-")
-    plain = dataclasses.replace(preset(config.recipe, config.scale), scenario=config.scenario, seed=config.seed)
+    name = f"{config.scenario}-{config.recipe}-{config.scale}-{config.plan}-seed{config.seed}".replace(":", "-")
+    plain = dataclasses.replace(
+        preset(config.recipe, config.scale, config.plan), scenario=config.scenario, seed=config.seed
+    )
     if without_place(config) != without_place(plain):
         # Any other setting gets a directory of its own, so that it does not meet the run without it.
         differing = json.dumps(to_dict(without_place(config)), sort_keys=True)
@@ -493,6 +515,24 @@ def _report(options: Report, config: Config) -> int:
     return 0
 
 
+def _presets(options: Presets, config: Config) -> int:
+    if not options.first:
+        for recipe, plans in OF_RECIPE.items():
+            print(f"{recipe}: scales {', '.join(SCALES)}; plans {', '.join(plans)} (usual: {DEFAULT_PLAN[recipe]})")
+        return 0
+    first = preset(*options.first.split("/", 2))
+    if not options.second:
+        print(to_toml(to_dict(first)), end="")
+        return 0
+    rows = differences(first, preset(*options.second.split("/", 2)))
+    width = max(map(len, rows), default=0)
+    for name, (here, there) in rows.items():
+        print(f"{name:<{width}}  {here!r} -> {there!r}")
+    if not rows:
+        print("They set the same.")
+    return 0
+
+
 def _models(options: Models, config: Config) -> int:
     from rapid.teacher import models
 
@@ -543,6 +583,7 @@ _VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "teach-bench": (TeachBench, _teach_bench),
     "export": (Export, _export),
     "report": (Report, _report),
+    "presets": (Presets, _presets),
     "models": (Models, _models),
     "verify-simulator": (VerifySimulator, _verify),
     "doctor": (Doctor, _doctor),

@@ -45,7 +45,7 @@ def learner_on(device: str, config: Config, loss: LossConfig, optimizer: Optimiz
 CASES = {
     "strong": (STRONG, STRONG.distill.loss, STRONG.distill.optimizer, "distill"),
     "paper": (PAPER, PAPER.distill.loss, PAPER.distill.optimizer, "distill"),
-    "adapt": (STRONG, preset("strong", "long").adapt.loss, STRONG.adapt.optimizer, "adapt"),
+    "adapt": (STRONG, preset("strong", "full", "ppo").adapt.loss, STRONG.adapt.optimizer, "adapt"),
     "mirror": (
         replace(STRONG, network=replace(STRONG.network, mirror=True)),
         STRONG.distill.loss,

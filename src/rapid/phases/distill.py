@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 from rapid.agents.saved import QAgent, save_agent
 from rapid.config import Config, without_place
 from rapid.config_io import to_dict
 from rapid.data.dataset import Dataset, load_dataset
 from rapid.errors import RapidError
-from rapid.experiments.paper import paper_numbers
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.networks.stack import stack_networks, unstack_networks
 from rapid.phases.data import learnable
@@ -21,31 +19,6 @@ from rapid.seeding import stream_seed
 from rapid.tracking import Tracker
 from rapid.training.machinery.record import CHECKPOINT_FILE
 from rapid.training.offline import distill, is_stackable
-
-
-def baseline(config: Config, algorithm: Literal["dqn", "ddqn", "cql", "bc"]) -> Config:
-    """Return the settings of an MLP that learns offline by another algorithm: the baselines.
-
-    They are those of RAPID but for what makes the algorithm; in the recipe `paper`, step size, batch and target updates
-    are what the paper's table prints for it. CQL builds on double DQN, as d3rlpy's does.
-    """
-    loss = replace(
-        config.distill.loss,
-        conservative_weight=1.0 if algorithm == "cql" else 0.0,
-        robust_weight=0.0,
-        double=algorithm in ("ddqn", "cql"),
-    )
-    optimizer = replace(config.distill.optimizer, algorithm="bc" if algorithm == "bc" else "dqn")
-    if config.recipe == "paper" and algorithm != "bc":
-        printed = paper_numbers()["hyperparameters"][algorithm]
-        optimizer = replace(
-            optimizer,
-            learning_rate=printed["learning_rate"],
-            batch_size=printed["batch_size"],
-            target_update=printed["target_update_interval"],
-        )
-    network = replace(config.network, kind="mlp")
-    return replace(config, network=network, distill=replace(config.distill, loss=loss, optimizer=optimizer))
 
 
 def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled") -> QAgent:

@@ -12,7 +12,7 @@ from rapid.evaluation.recording import Recording, load_recordings
 from rapid.files import read_json
 from rapid.phases.adapt import PPO
 from rapid.phases.data import data_folders
-from rapid.presets import preset
+from rapid.presets import of_file, without_presets
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.runs import STEPS
 from rapid.training.machinery.record import load_metrics
@@ -25,7 +25,8 @@ def report_again(directory: Path) -> Path:
         RapidError: there is no run, or it has not been measured yet.
     """
     manifest = read_json(directory / "run.json", "run manifest")
-    config = apply_overrides(preset(), manifest.get("config", {}), source=f"'{directory / 'run.json'}'")
+    settings = manifest.get("config", {})
+    config = apply_overrides(of_file(settings), without_presets(settings), source=f"'{directory / 'run.json'}'")
     return write_run_report(config, directory)
 
 

@@ -86,7 +86,9 @@ def adapt_by_ppo(
     """
     if network.is_stack:
         raise RapidError("A stack of networks cannot drive. Adapt one network at a time.")
-    ppo = config.ppo
+    ppo, seen = config.ppo, get_scenario(scenario)
+    if seen.reward == "progress":
+        ppo = replace(ppo, crash_penalty=ppo.progress_crash_penalty)
     if ppo.steps < least_steps(ppo):
         raise RapidError(
             f"adapt.ppo.steps is {ppo.steps}, but the policy learns nothing in less than {least_steps(ppo)}: "
@@ -95,7 +97,6 @@ def adapt_by_ppo(
     per_rollout = ppo.num_envs * ppo.rollout
     # No more than asked for: whole rollouts would otherwise go beyond a budget.
     rollouts = ppo.steps // per_rollout
-    seen = get_scenario(scenario)
     device = str(next(network.parameters()).device)
     record = Record(
         directory,
