@@ -99,7 +99,7 @@ def spawns(data: Dataset) -> list[int]:
 def spoken(data: Dataset) -> tuple[float, float]:
     """Return the turns of the model and its tool calls, a decision."""
     assert data.log is not None
-    talks = [json.loads(text) for text in data.log.column("transcript").to_pylist()]
+    talks = [json.loads(text) for text in data.log.column("turns").to_pylist()]
     turns = sum(message["role"] == "assistant" for talk in talks for message in talk)
     calls = sum(message["content"].startswith("RESULT ") for talk in talks for message in talk)
     return turns / len(talks), calls / len(talks)

@@ -113,7 +113,7 @@ def test_a_collection_leaks_no_key(server, tmp_path, monkeypatch, capfd, caplog,
 
     assert any(header == f"Bearer {key}" for header in server.authorization)
     dataset = load_dataset(tmp_path / "data")
-    assert "[key]" in "".join(dataset.log.column("transcript").to_pylist())
+    assert "[key]" in "".join(dataset.log.column("turns").to_pylist())
     assert dataset.memory
     output = capfd.readouterr()
     said += [output.out, output.err, caplog.text]

@@ -49,7 +49,8 @@ def test_every_shipped_set_is_whole_and_names_no_place(name: str):
     assert data.log is not None
     assert data.log.num_rows == len(data)
     if kind in ("teacher", "react"):
-        assert all(data.log.column("transcript").to_pylist())
+        assert all(data.log.column("told").to_pylist())
+        assert all(data.log.column("computed").to_pylist()) == (kind == "teacher")
     facts = (dataset_folder(f"shipped:{name}") / "dataset.json").read_text()
     assert not re.search(r"/(home|root|tmp|work|Users)\b|api_key|base_url", facts)
 

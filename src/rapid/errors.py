@@ -1,5 +1,6 @@
 """Errors that a user can act on: what was wrong, what was expected, what to do."""
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -7,8 +8,18 @@ from difflib import get_close_matches
 class RapidError(Exception):
     """A mistake in the input or the surroundings, explained in one paragraph.
 
-    The command line prints the message without a traceback and exits with 2.
+    The command line prints the message without a traceback and exits with 2. Foreign words that it quotes may end with
+    a full stop of their own: one is enough.
     """
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(re.sub(r"([.!?])\.(?!\S)(?<!\.\.\.)", r"\1", message))
+
+
+def sentence(text: str) -> str:
+    """Return foreign words as a sentence, with one full stop at its end."""
+    text = text.strip()
+    return text if text.endswith((".", "!", "?", "…")) else f"{text}."
 
 
 def did_you_mean(name: str, choices: Iterable[str]) -> str:

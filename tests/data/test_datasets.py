@@ -8,7 +8,7 @@ import pytest
 from fake_worlds import assert_equal, fake_transitions
 from rapid.data.card import card
 from rapid.data.dataset import Dataset, episode_returns, join, load_dataset, mix, save_dataset
-from rapid.data.tables import LOG_SCHEMA
+from rapid.data.tables import LOG_SCHEMA, current_log
 from rapid.data.transitions import RANDOM, TEACHER, Transitions
 from rapid.errors import RapidError
 
@@ -155,3 +155,24 @@ def test_the_card_says_what_a_stranger_must_know():
     for fact in (SCENARIO, "200 transitions", "fake", "35.0%", "Apache-2.0", "LANE_LEFT", "Status: ok 200"):
         assert fact in text
     assert "p = 0.25" in card(mix(teacher(), random(), 0.25, 100, 0))
+
+
+def test_a_log_of_an_older_version_tells_what_was_told_from_what_was_computed():
+    told, reason = [{"role": "user", "content": "Safe: keep."}], "a “calm” road"
+    answers = ["keep", json.dumps({"explanation": reason, "action": "keep"}), "hm", ""]
+    old = pa.table(
+        {
+            "answer": answers,
+            "explanation": ["keep: safe, 9 m", reason, "no usable answer; keep leaves most room", "the road is free"],
+            "status": ["ok", "repaired", "fallback", "scripted"],
+            "transcript": [json.dumps([*told, {"role": "assistant", "content": answer}]) for answer in answers[:3]] + [""],
+        }
+    )
+    rows = current_log(old).to_pylist()
+    assert [row["told"] for row in rows] == ["Safe: keep."] * 3 + [""]
+    assert [row["explanation"] for row in rows] == ["", reason, "", "the road is free"]
+    assert [row["computed"] for row in rows] == ["keep: safe, 9 m", "", "no usable answer; keep leaves most room", ""]
+    assert json.loads(rows[1]["turns"]) == [{"role": "assistant", "content": answers[1]}]
+    assert current_log(current_log(old)) == current_log(old)
+    with pytest.raises(RapidError, match="transcript"):
+        current_log(old.set_column(3, "transcript", pa.array(["{", "[1]", "7", "x"])))

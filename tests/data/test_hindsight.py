@@ -231,7 +231,7 @@ def test_what_one_collection_learns_the_next_remembers_and_a_replay_repeats(tmp_
     assert any(past.lesson == "leave room" for past in first.memory)
     second = drive("second", Memory(read_experiences(tmp_path / "first" / "memory.jsonl")), 2)
     assert second.memory[: len(first.memory)] == first.memory
-    assert any("leave room" in said for said in second.log.column("transcript").to_pylist())
+    assert any("leave room" in said for said in second.log.column("told").to_pylist())
     assert second.drivers["teacher"]["memory"]["sha256"] == Memory(first.memory).sha256
     replay = Replay(TeacherConfig(backend="replay", replay_file=str(tmp_path / "second")), 3)
     third = run(tmp_path / "third", replay, 60)

@@ -11,8 +11,9 @@ from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.teacher.chat import ChatError, Conversation, Reply, Request, ToolCall, converse
 from rapid.teacher.conversation import ConversingTeacher
-from rapid.teacher.decision import Decision, to_record
+from rapid.teacher.decision import Decision, UnreachableError, to_record
 from rapid.teacher.facts import gather, safest
+from rapid.teacher.prompt import WORDS
 from rapid.teacher.replay import Replay
 from rapid.teacher.scene import read_scenes
 
@@ -48,7 +49,7 @@ def test_a_good_answer_is_taken_with_its_account(world):
     assert (decision.action, decision.explanation, decision.status) == (1, "calm road", "ok")
     assert (decision.tokens_in, decision.tokens_out, decision.retries) == (100, 20, 1)
     assert decision.cost == pytest.approx((100 * 2 + 20 * 10) / 1e6)
-    assert json.loads(decision.transcript)[-1] == {"role": "assistant", "content": KEEP}
+    assert json.loads(decision.turns) == [{"role": "assistant", "content": KEEP}]
 
 
 @pytest.mark.parametrize("bad", ["", "no idea", '{"action": "jump"}', '{"action"', "I cannot help with driving."])
@@ -159,14 +160,15 @@ def test_a_call_on_the_forced_turn_is_no_decision(world, form):
     assert decide(Script(call, native_tools=False), world, "react", max_turns=1).status == "fallback"
 
 
-def test_a_dead_server_falls_back_then_stops(world):
-    driver = teacher(Script(ChatError("APIConnectionError: gone", 4)))
+def test_a_server_that_goes_down_falls_back_then_stops(world):
+    driver = teacher(Script(Reply(KEEP), ChatError("APIConnectionError: gone.", 4)))
     obs_BVF = world()
+    assert driver.decide(obs_BVF, [None])[0].status == "ok"
     for _ in range(4):
         decision = driver.decide(obs_BVF, [None])[0]
-        assert (decision.status, decision.retries) == ("fallback", 4)
+        assert (decision.status, decision.retries, decision.unanswered) == ("fallback", 4, True)
         assert "gone" in decision.error
-    with pytest.raises(RapidError, match="5 decisions in a row"):
+    with pytest.raises(UnreachableError, match=r"5 decisions in a row; the last time: no answer: .* gone\. Is it"):
         driver.decide(obs_BVF, [None])
 
 
@@ -178,11 +180,74 @@ def test_the_last_decision_and_its_reason_are_told(world, style):
     assert "Your previous decision: slower. the lead car brakes" in script.heard[0][1]["content"]
 
 
-def test_a_word_alone_is_explained_by_what_was_told(world):
+def test_what_was_told_answered_and_computed_are_three_things(world):
     decision = decide(Script(Reply("keep", (), 100, 1)), world)
-    assert (decision.action, decision.status, decision.answer) == (1, "ok", "keep")
-    assert f"\nkeep: {decision.explanation}" in json.loads(decision.transcript)[0]["content"]
+    assert (decision.action, decision.status, decision.answer, decision.explanation) == (1, "ok", "keep", "")
+    assert f"\nkeep: {decision.computed}" in decision.told
+    assert json.loads(decision.turns) == [{"role": "assistant", "content": "keep"}]
     assert decision.probabilities is None
+
+
+@pytest.mark.parametrize("style", ["digest", "react"])
+@pytest.mark.parametrize("answer", ["no idea", "", '{"explanation": "x", "action": "fly"}'])
+def test_nothing_internal_enters_a_prompt(world, style, answer):
+    before = decide(Script(Reply(answer)), world, style)
+    assert before.status == "fallback"
+    assert before.computed.startswith("the rule's choice")
+    assert (before.explanation, decide(Script(Reply("keep")), world, style).explanation) == ("", "")
+    script = Script(Reply("keep"))
+    teacher(script, style).decide(world(), [before])
+    told = json.dumps(script.heard)
+    assert f"The car's last action: {WORDS[before.action]}." in told
+    assert "previous decision" not in told
+    assert "rule" not in told.replace("Rules", "")
+    assert "usable" not in told
+    # A word gives no reason, and ours is not put into its mouth.
+    script = Script(Reply("keep"))
+    teacher(script, style).decide(world(), [Decision(1, answer="keep", computed="safe, 9 m", status="ok")])
+    assert "Your previous decision: keep.\n" in script.heard[0][1]["content"]
+
+
+def test_a_copied_example_is_no_reason(world):
+    copied = Reply('{"explanation": "at most ten words", "action": "keep"}')
+    assert decide(Script(copied), world, "react").explanation == ""
+    script = Script(Reply("hm"), copied)
+    assert decide(script, world, "react").status == "repaired"
+    assert "{" not in script.heard[1][-1]["content"]
+
+
+def test_an_answer_that_was_cut_off_says_what_to_raise(world):
+    cut = Reply("I think that", finish_reason="length")
+    decision = decide(Script(cut), world, max_answer_tokens=7)
+    assert decision.status == "fallback"
+    assert "cut off at --teacher.max-answer-tokens 7." in decision.error
+    assert "--teacher" not in decision.turns
+    # A word that was cut off may have been the beginning of another, or of a sentence; a whole object is whole.
+    assert decide(Script(Reply("keep", finish_reason="length")), world).status == "fallback"
+    assert decide(Script(Reply(KEEP + " As the", finish_reason="length")), world, "react").status == "ok"
+
+
+@pytest.mark.parametrize("style", ["digest", "react"])
+def test_thinking_without_an_answer_is_no_answer(world, style):
+    decision = decide(Script(Reply("", reasoning="keep"), Reply(KEEP)), world, style)
+    assert (decision.status, decision.error) == ("repaired", "The answer is thinking only, and holds no decision.")
+
+
+def test_a_call_that_nobody_offered_is_no_decision(world):
+    called = Reply("faster", (ToolCall("1", "forecast_action", '{"action": "faster"}'),))
+    for style in ("digest", "react"):
+        decision = decide(Script(called), world, style, max_turns=1)
+        assert decision.status == "fallback", style
+        assert "call" in decision.error
+
+
+def test_a_word_before_any_forecast_says_what_to_forecast(world):
+    """In react style the model is asked "Which do you forecast first?": a word is the answer to that."""
+    script = Script(Reply("faster"), Reply(KEEP))
+    decision = decide(script, world, "react")
+    assert (decision.action, decision.status) == (1, "repaired")
+    # Once it was asked for the decision, a word is one.
+    assert decide(Script(Reply("faster")), world, "react").action == 3
 
 
 def test_the_same_state_gives_the_same_prompt(world):

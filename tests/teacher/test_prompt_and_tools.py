@@ -5,7 +5,9 @@ import json
 import pytest
 
 from rapid.scenarios import ACTIONS, FASTER, IDLE
-from rapid.teacher.briefing import briefing, is_finished, read_call, read_choice
+from rapid.teacher.answers import read_choice
+from rapid.teacher.briefing import briefing
+from rapid.teacher.calls import is_finished, read_call
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import gather
 from rapid.teacher.prompt import WORDS, calibration, digest, digest_system, prompt_version
@@ -126,14 +128,14 @@ ARGUMENTS = '{"action": "faster"}'
 )
 def test_an_object_after_the_name_of_a_tool_is_no_decision(facts, text):
     assert read_call(text) == ("forecast_action", ARGUMENTS)
-    assert read_choice(text, facts, "react").fault == "That was a call, not a decision."
+    assert read_choice(text, facts, words=False).fault == "That was a call, not a decision."
     assert is_finished(text)
 
 
 def test_a_decision_may_name_a_tool(facts):
     text = 'As forecast_action said: {"explanation": "forecast_action says safe", "action": "faster"}'
     assert read_call(text) is None
-    assert read_choice(text, facts, "react").action == FASTER
+    assert read_choice(text, facts, words=False).action == FASTER
 
 
 @pytest.mark.parametrize(
@@ -167,7 +169,7 @@ def test_in_react_style_the_cars_are_to_be_asked_for(facts):
 )
 def test_answers_are_found_wherever_they_stand(facts, form):
     answer = json.dumps({"explanation": "calm", "action": "keep"})
-    choice = read_choice(form.format(answer), facts, "react")
+    choice = read_choice(form.format(answer), facts, words=False)
     assert (choice.action, choice.explanation) == (IDLE, "calm")
 
 
@@ -175,17 +177,17 @@ def test_answers_are_found_wherever_they_stand(facts, form):
     "text", ["", "  ", "keep", '{"action": "keep"', '{"action": "hover"}', '{"action": null}', "[1]", "{" * 3000, "{}"]
 )
 def test_unusable_answers_have_a_fault(facts, text):
-    choice = read_choice(text, facts, "react")
+    choice = read_choice(text, facts, words=False)
     assert choice.action is None
     assert choice.fault
 
 
 @pytest.mark.parametrize("text", ["keep", " Keep.\n", "**keep**", "Let me see.\n\nkeep", '{"action": "keep"}'])
 def test_one_word_does_in_digest_style(facts, text):
-    assert read_choice(text, facts, "digest").action == IDLE
-    assert read_choice("keep or slower", facts, "digest").fault.startswith("The answer is neither")
+    assert read_choice(text, facts).action == IDLE
+    assert read_choice("keep or slower", facts).fault.startswith("The answer is neither")
 
 
 def test_impossible_actions_have_a_fault(world):
     facts = gather(read_scenes(world(lane=0), 3)[0])
-    assert "not possible" in read_choice('{"action": "left"}', facts, "react").fault
+    assert "not possible" in read_choice('{"action": "left"}', facts).fault

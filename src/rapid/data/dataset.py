@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from rapid.data.shipped import dataset_folder
-from rapid.data.tables import from_table, read_parquet, to_table, write_parquet
+from rapid.data.tables import current_log, from_table, read_parquet, to_table, write_parquet
 from rapid.data.transitions import RANDOM, SOURCES, TEACHER, Transitions, concatenate
 from rapid.errors import RapidError
 from rapid.files import read_json, sha256, write_json, write_text
@@ -116,7 +116,7 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
         for name, facts in meta["files"].items():
             _check_file(root / name, facts)
         table = read_parquet(root / TRANSITIONS_FILE, "transitions")
-        log = read_parquet(root / LOG_FILE, "teacher log") if LOG_FILE in meta["files"] else None
+        log = current_log(read_parquet(root / LOG_FILE, "teacher log")) if LOG_FILE in meta["files"] else None
         memory = read_experiences(root / MEMORY_FILE) if MEMORY_FILE in meta["files"] else None
         dataset = Dataset(
             meta["scenario"], from_table(table), meta["drivers"], log, meta["mixture"], meta["collection"], memory

@@ -17,6 +17,7 @@ from rapid.data.tables import (
     LOG_SCHEMA,
     PART_SCHEMA,
     TRANSITION_SCHEMA,
+    current_log,
     from_table,
     read_parquet,
     to_table,
@@ -86,7 +87,8 @@ class Collecting:
         self.teacher, self.settings, self.work, self.budget, self.progress = teacher, settings, work, budget, progress
         self.watch = watch
         self.source = SOURCES.index(settings["source"])
-        self.parts = [read_parquet(path, "part of a collection") for path in sorted(work.glob("part-*.parquet"))]
+        paths = sorted(work.glob("part-*.parquet"))
+        self.parts = [current_log(read_parquet(path, "part of a collection")) for path in paths]
         self.count = sum(part.num_rows for part in self.parts)
         self.episodes = sum(len(part.column("episode").unique()) for part in self.parts)
         self.fresh, self.decisions = 0, self.count

@@ -1,5 +1,6 @@
 """Transitions and the teacher's log as Arrow tables, and Parquet files of them that are equal byte for byte."""
 
+import json
 import os
 from typing import Any
 
@@ -12,6 +13,7 @@ from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
 from rapid.files import atomic_path
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
+from rapid.teacher.decision import split_transcript
 
 _OBS = pa.list_(pa.float32(), NUM_VEHICLES * NUM_FEATURES)
 
@@ -41,8 +43,10 @@ LOG_SCHEMA = pa.schema(
         pa.field("source", pa.int8(), False),
         pa.field("action", pa.int8(), False),
         pa.field("prompt_hash", pa.string()),
+        pa.field("told", pa.string()),
         pa.field("answer", pa.string()),
         pa.field("explanation", pa.string()),
+        pa.field("computed", pa.string()),
         pa.field("status", pa.string()),
         pa.field("error", pa.string()),
         pa.field("retries", pa.int32()),
@@ -50,10 +54,10 @@ LOG_SCHEMA = pa.schema(
         pa.field("tokens_out", pa.int64()),
         pa.field("seconds", pa.float64()),
         pa.field("cost", pa.float64()),
-        pa.field("transcript", pa.string()),
+        pa.field("turns", pa.string()),
     ]
 )
-"""One row a decision: everything that was said. `transcript` is JSON."""
+"""One row a decision: what was told, answered and computed are three columns; `turns` is JSON."""
 
 PART_SCHEMA = pa.schema(
     [*TRANSITION_SCHEMA, *(field for field in LOG_SCHEMA if field.name not in TRANSITION_SCHEMA.names)]
@@ -131,6 +135,45 @@ def from_table(table: pa.Table) -> Transitions:
         spawn_seed_N=columns["spawn_seed"].astype(np.int64),
         probabilities_NA=probabilities,
     )
+
+
+def current_log(table: pa.Table) -> pa.Table:
+    """Return a table with the columns of the log as they are now, of one that may be from before version 0.2.
+
+    There, `transcript` held what was told together with the turns after it, and `explanation` RAPID's own words where
+    the model had given no reason.
+
+    Raises:
+        RapidError: a transcript cannot be read.
+    """
+    if "transcript" not in table.column_names:
+        return table
+    names = ("transcript", "answer", "explanation", "status")
+    columns: dict[str, list[str]] = {"told": [], "turns": [], "explanation": [], "computed": []}
+    for transcript, answer, explanation, status in zip(
+        *(table.column(name).to_pylist() for name in names), strict=True
+    ):
+        told, turns = split_transcript(transcript)
+        ours = status == "fallback" or (status != "scripted" and not _gives(answer or "", explanation or ""))
+        for name, value in (
+            ("told", told),
+            ("turns", turns),
+            ("explanation", "" if ours else explanation),
+            ("computed", explanation if ours else ""),
+        ):
+            columns[name].append(value)
+    for name, values in columns.items():
+        column = pa.array(values, pa.string())
+        place = table.schema.get_field_index(name)
+        field = pa.field(name, pa.string())
+        table = table.append_column(field, column) if place < 0 else table.set_column(place, field, column)
+    order = [name for name in PART_SCHEMA.names if name in table.column_names]
+    return table.select(order)
+
+
+def _gives(answer: str, explanation: str) -> bool:
+    """Say whether a model gave this reason; what was cut off may have held it."""
+    return explanation in answer or json.dumps(explanation)[1:-1] in answer or len(answer) >= 1200
 
 
 def write_parquet(table: pa.Table, path: str | os.PathLike[str]) -> None:

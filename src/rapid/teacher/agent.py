@@ -1,7 +1,6 @@
 """The decision loop: scene, facts, prompt, model, decision."""
 
 import dataclasses
-import json
 import time
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -80,15 +79,15 @@ class ScoringTeacher:
             decisions.append(
                 Decision(
                     action,
-                    explanation=f"{WORDS[action]}: {outcome(facts, action)}",
                     answer=WORDS[action],
                     probabilities=tuple(probabilities_A.tolist()),
+                    told=prompt.user,
+                    computed=outcome(facts, action),
                     prompt_hash=prompt.hash,
                     status="ok",
                     tokens_in=count,
                     tokens_out=1,
                     seconds=seconds,
-                    transcript=json.dumps([{"role": "user", "content": prompt.user}]),
                 )
             )
         return decisions

@@ -1,23 +1,17 @@
-"""What a model that converses is told, and how its answers are read (paper: appendix "Prompt Setup").
+"""What a model that converses is told (paper: appendix "Prompt Setup"); :mod:`rapid.teacher.answers` reads it.
 
 The prefix prompt holds the task, the rules, the output format, examples from a memory if there is one, the scene, and
 the previous decision with its reason.
 In `digest` style all tool results stand in it; in `react` style the model asks for them.
 """
 
-import json
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import Facts
 from rapid.teacher.prompt import WORDS, Prompt, outcome
-from rapid.teacher.tools import TOOL_NAMES, action_named, describe_car, tool_help
-
-EXPLANATION_LIMIT = 300
-"""Characters of an explanation that are kept and fed back."""
+from rapid.teacher.tools import describe_car, tool_help
 
 DECISION_SCHEMA: dict[str, Any] = {
     "type": "object",
@@ -32,30 +26,12 @@ _FORMATS = {
     "digest": "Answer with one word, the action, and nothing else.",
     "react": 'Give your decision as JSON and nothing else: {"explanation": "at most ten words", "action": "ACTION"}',
 }
-_NAMES = "|".join(TOOL_NAMES)
-_GAP = r"[^\w{]*(?:json\s*)?"
-# Small models leave the word CALL out, or put other words, brackets or punctuation around it. A call must not be taken
-# for a decision: an object that follows a tool's name holds arguments.
-_CALL = re.compile(
-    rf"""
-    (?: ^[ \t]*CALL[ \t]+                         # CALL and any name,
-      | \b(?=(?:{_NAMES}){_GAP}\{{)               # or a tool's name before an object,
-      | ^[ \t]*(?=(?:{_NAMES})[ \t]*(?:\(|$)) )   # or before a bracket, or alone in a line;
-    (\w+)
-    (?: {_GAP}(\{{[^{{}}]*\}})                    # then an object,
-      | [ \t]*\(?(.*?)\)?[ \t]*$ )                # or whatever follows in the line
-    """,
-    re.MULTILINE | re.VERBOSE,
-)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """A model's final answer: the action or, if `action` is `None`, what is wrong with it."""
-
-    action: int | None
-    explanation: str = ""
-    fault: str = ""
+_REPAIRS = {
+    "digest": _FORMATS["digest"],
+    # No example: what stands in one is copied.
+    "react": 'Give your decision as a JSON object and nothing else. It has two keys: "explanation", your own reason in a '
+    'few words, and "action", one of the possible actions.',
+}
 
 
 def briefing(
@@ -65,7 +41,7 @@ def briefing(
 
     Args:
         facts: the scene and its facts.
-        previous: the last decision, which is told with its reason.
+        previous: the last decision, which is told with the reason that the model itself gave, if any.
         style: `digest` or `react`.
         native_tools: whether the server knows about tools itself.
         examples: past situations, one a line (:func:`rapid.teacher.memory.show`), the most similar first.
@@ -99,7 +75,10 @@ def briefing(
         # Who can ask for the others is spared them: what is read costs time or money.
         lead = scene.lead(scene.lane)
         lines.append(f"Ahead is {describe_car(lead)}." if lead else "No car is ahead on your lane.")
-    if previous:
+    if previous and previous.status == "fallback" and not previous.explanation:
+        # It was not the model's, and why it was taken is nothing that a driver could know.
+        lines.append(f"The car's last action: {WORDS[previous.action]}.")
+    elif previous:
         lines.append(f"Your previous decision: {WORDS[previous.action]}. {previous.explanation}".rstrip())
     if style == "digest":
         lines.append("What each action leads to:")
@@ -109,44 +88,6 @@ def briefing(
     return Prompt(system, "\n".join(lines))
 
 
-def read_call(text: str) -> tuple[str, str] | None:
-    """Return the tool and the arguments that a text asks for, or `None`."""
-    match = _CALL.search(text)
-    return (match[1], match[2] or match[3] or "{}") if match else None
-
-
-def is_finished(text: str) -> bool:
-    """Say whether a text that is still being written holds a whole call or decision: the rest would be made up."""
-    call = _CALL.search(text)
-    if call:
-        return bool(call[2]) or call[3].endswith("}") or "\n" in text[call.end() :]
-    return "action" in (_last_object(text) or {})
-
-
-def read_choice(text: str, facts: Facts, style: str, reason: str = "explanation") -> Choice:
-    """Read a final answer strictly: a JSON object (in `digest` style one word does) with a known, possible action.
-
-    `reason` names the field that becomes the choice's explanation.
-    """
-    if not text.strip():
-        return Choice(None, fault="The answer was empty.")
-    if style == "react" and read_call(text):
-        return Choice(None, fault="That was a call, not a decision.")
-    # Some think aloud first; a last line that is an action says what they mean.
-    word = text.strip().splitlines()[-1].strip(" .\"'`*")
-    answer = {"action": word} if style == "digest" and action_named(word) is not None else _last_object(text)
-    if answer is None:
-        fault = "is neither an action nor a JSON object" if style == "digest" else "holds no JSON object"
-        return Choice(None, fault=f"The answer {fault}.")
-    action = action_named(answer.get("action"))
-    if action is None:
-        return Choice(None, fault=f"The action {json.dumps(answer.get('action'))[:80]} does not exist.")
-    if action not in facts.available:
-        return Choice(None, fault=f"The action {WORDS[action]} is not possible here.")
-    explanation = answer.get(reason)
-    return Choice(action, explanation[:EXPLANATION_LIMIT] if isinstance(explanation, str) else "")
-
-
 def tool_result(result: str) -> str:
     """Return the message that answers a call in plain text."""
     return f"RESULT {result}\nCall again, or decide."
@@ -154,25 +95,8 @@ def tool_result(result: str) -> str:
 
 def repair_request(fault: str, facts: Facts, style: str) -> str:
     """Return the message that asks once for a corrected answer."""
-    return f"{fault} Possible actions: {_possible(facts)}. {_FORMATS[style]}"
+    return f"{fault} Possible actions: {_possible(facts)}. {_REPAIRS[style]}"
 
 
 def _possible(facts: Facts) -> str:
     return ", ".join(WORDS[action] for action in facts.available)
-
-
-def _last_object(text: str) -> dict[str, Any] | None:
-    """Return the last JSON object in a text, whatever stands around it."""
-    decoder = json.JSONDecoder()
-    found: dict[str, Any] | None = None
-    position = text.find("{")
-    while position >= 0:
-        try:
-            value, end = decoder.raw_decode(text, position)
-        except (ValueError, RecursionError):
-            position = text.find("{", position + 1)
-            continue
-        if isinstance(value, dict):
-            found = value
-        position = text.find("{", end)
-    return found

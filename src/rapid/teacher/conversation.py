@@ -17,25 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
-from rapid.errors import RapidError
+from rapid.errors import sentence
 from rapid.scenarios import IDLE
-from rapid.teacher.briefing import (
-    DECISION_SCHEMA,
-    EXPLANATION_LIMIT,
-    Choice,
-    briefing,
-    read_call,
-    read_choice,
-    repair_request,
-    tool_result,
-)
+from rapid.teacher.answers import EXPLANATION_LIMIT, Choice, read_choice, spoken
+from rapid.teacher.briefing import DECISION_SCHEMA, briefing, repair_request, tool_result
+from rapid.teacher.calls import read_call
 from rapid.teacher.chat import BatchChat, Chat, ChatError, Conversation, Message, Reply, Request, converse
-from rapid.teacher.decision import Decision
+from rapid.teacher.decision import NO_ANSWER, Decision, UnreachableError
 from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts, gather, safest
 from rapid.teacher.logprobs import Token, action_probabilities
 from rapid.teacher.memory import Episode, Memory, identify, show
-from rapid.teacher.prompt import WORDS, Prompt, outcome
+from rapid.teacher.prompt import Prompt, outcome
 from rapid.teacher.reflection import (
     LESSON_SCHEMA,
     experience_of,
@@ -115,7 +108,8 @@ class ConversingTeacher:
         """Decide for each world; see :meth:`rapid.teacher.decision.Teacher.decide`.
 
         Raises:
-            RapidError: also if the server refuses the key or the model, or seems to be down.
+            RapidError: also if the server refuses the key or the model.
+            UnreachableError: the server seems to be down.
         """
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
         start = time.perf_counter()
@@ -124,8 +118,7 @@ class ConversingTeacher:
             seconds = (time.perf_counter() - start) / max(len(decisions), 1)
             decisions = [dataclasses.replace(decision, seconds=seconds) for decision in decisions]
         for decision in decisions:
-            lost = decision.status == "fallback" and decision.error.startswith("no answer")
-            self._watch(decision.error if lost else "")
+            self._watch(decision.error if decision.unanswered else "")
         return decisions
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
@@ -141,9 +134,9 @@ class ConversingTeacher:
         """Count what was lost to the server, and stop if it seems to be down."""
         self._failures = self._failures + 1 if fault else 0
         if self._failures >= FAILURES_IN_A_ROW:
-            raise RapidError(
-                f"The model's server failed {self._failures} decisions in a row; the last time: {fault}. "
-                "Is it running and reachable? What was collected is kept: run the same command again."
+            raise UnreachableError(
+                f"The model's server failed {self._failures} decisions in a row; the last time: {sentence(fault)} "
+                "Is it running and reachable? What was decided with it is kept: run the same command again."
             )
 
     def _look_back(self, episode: Episode) -> Conversation[tuple[Experience, str]]:
@@ -157,12 +150,14 @@ class ConversingTeacher:
         talk = _Talk(_opening(reflection_prompt(facts_T, episode.decisions, step)))
         choice, lost = Choice(None), ""
         try:
-            choice = read_lesson((yield from self._ask(talk, [], LESSON_SCHEMA)).text, facts)
+            reply = yield from self._ask(talk, [], LESSON_SCHEMA)
+            choice = read_lesson(reply.text, facts, _was_cut(reply))
             if choice.action is None:
                 talk.messages.append({"role": "user", "content": lesson_request(choice.fault, facts)})
-                choice = read_lesson((yield from self._ask(talk, [], LESSON_SCHEMA)).text, facts)
+                reply = yield from self._ask(talk, [], LESSON_SCHEMA)
+                choice = read_lesson(reply.text, facts, _was_cut(reply))
         except ChatError as error:
-            lost = f"no answer: {error}"
+            lost = f"{NO_ANSWER}: {error}"
         if choice.action is not None:
             # The reason was that of the decision that led to the crash.
             experience = dataclasses.replace(
@@ -181,68 +176,78 @@ class ConversingTeacher:
         talk = _Talk(_opening(prompt))
         choice = Choice(None)
         try:
-            choice = read_choice((yield from self._reason(talk, facts)), facts, self._config.style)
+            choice = yield from self._reason(talk, facts)
             if choice.action is None:
-                talk.faults.append(choice.fault)
-                answer = yield from self._correct(talk, facts, choice.fault)
-                choice = read_choice(answer, facts, self._config.style)
-                if choice.action is None:
-                    talk.faults.append(choice.fault)
+                choice = yield from self._correct(talk, facts, choice.fault)
         except ChatError as error:
             talk.retries += error.retries
-            talk.faults.append(f"no answer: {error}")
-        status = "ok" if not talk.faults else "repaired"
-        action, probabilities = choice.action, None
+            talk.faults.append(f"{NO_ANSWER}: {error}")
+        status, action, computed, probabilities = "repaired" if talk.faults else "ok", choice.action, "", None
         if action is None:
             action, status = safest(facts), "fallback"
-            explanation = f"no usable answer; {WORDS[action]} leaves most room"
+            computed = "the rule's choice, since no answer could be used: "
         else:
-            # One word gives no reason: what was told about the action stands for it.
-            explanation = choice.explanation or outcome(facts, action)
             probabilities = action_probabilities(talk.tokens, action, facts.available)
         return Decision(
             action,
-            explanation=explanation,
+            explanation=choice.explanation,
             answer=talk.answer[: 4 * EXPLANATION_LIMIT],
             probabilities=probabilities,
+            told=prompt.user,
+            computed=computed + outcome(facts, action),
+            turns=json.dumps(talk.messages[2:]),
             prompt_hash=prompt.hash,
             status=status,
             # The transport's error goes first: it says why there was no answer at all.
-            error="; ".join(reversed(talk.faults)),
+            error=" ".join(map(sentence, reversed(talk.faults))),
             retries=talk.retries,
             tokens_in=talk.tokens_in,
             tokens_out=talk.tokens_out,
             seconds=time.perf_counter() - start,
             cost=self._cost(talk),
-            transcript=json.dumps(talk.messages[1:]),
         )
 
-    def _reason(self, talk: _Talk, facts: Facts) -> Conversation[str]:
+    def _reason(self, talk: _Talk, facts: Facts) -> Conversation[Choice]:
         """Let the model call tools until it answers without a call, or its turns are used up."""
         if self._config.style == "digest":
-            return (yield from self._conclude(talk))
+            return (yield from self._conclude(talk, facts))
         tools = tool_specifications()
         for _ in range(self._config.max_turns):
             reply = yield from self._ask(talk, tools, None)
-            spoken = read_call(reply.text) if not reply.calls else None
+            called = read_call(spoken(reply.text)[0]) if not reply.calls else None
             if reply.calls:
                 for call in reply.calls:
                     result = call_tool(facts, call.name, call.arguments)
                     talk.messages.append({"role": "tool", "tool_call_id": call.id, "content": result})
-            elif spoken:
-                talk.messages.append({"role": "user", "content": tool_result(call_tool(facts, *spoken))})
+            elif called:
+                talk.messages.append({"role": "user", "content": tool_result(call_tool(facts, *called))})
             else:
-                return reply.text
+                return self._read(talk, reply, facts, words=False)
         return (yield from self._correct(talk, facts, "No more tool calls."))
 
-    def _correct(self, talk: _Talk, facts: Facts, fault: str) -> Conversation[str]:
+    def _correct(self, talk: _Talk, facts: Facts, fault: str) -> Conversation[Choice]:
         talk.messages.append({"role": "user", "content": repair_request(fault, facts, self._config.style)})
-        return (yield from self._conclude(talk))
+        return (yield from self._conclude(talk, facts))
 
-    def _conclude(self, talk: _Talk) -> Conversation[str]:
+    def _conclude(self, talk: _Talk, facts: Facts) -> Conversation[Choice]:
         """Let the model decide without any more tools: with one word, or by the schema."""
         one_word = self._config.style == "digest"
-        return (yield from self._ask(talk, [], None if one_word else DECISION_SCHEMA, one_word)).text
+        reply = yield from self._ask(talk, [], None if one_word else DECISION_SCHEMA, one_word)
+        return self._read(talk, reply, facts, words=True)
+
+    def _read(self, talk: _Talk, reply: Reply, facts: Facts, words: bool) -> Choice:
+        """Read a reply as a decision, and note why it is none, with what the user could do about it."""
+        tools = self._config.style == "react"
+        if reply.calls:
+            choice = Choice(None, fault="That was a call, not a decision." if tools else "There are no tools to call.")
+        elif reply.reasoning and not reply.text.strip():
+            choice = Choice(None, fault="The answer is thinking only, and holds no decision.")
+        else:
+            choice = read_choice(reply.text, facts, words=words, cut=_was_cut(reply), tools=tools)
+        if choice.action is None:
+            limit = f" It was cut off at --teacher.max-answer-tokens {self._config.max_answer_tokens}."
+            talk.faults.append(choice.fault + (limit if _was_cut(reply) else ""))
+        return choice
 
     def _ask(
         self, talk: _Talk, tools: list[dict[str, Any]], schema: dict[str, Any] | None, logprobs: bool = False
@@ -259,3 +264,7 @@ class ConversingTeacher:
             ]
         talk.messages.append(message)
         return reply
+
+
+def _was_cut(reply: Reply) -> bool:
+    return reply.finish_reason == "length"

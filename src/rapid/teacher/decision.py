@@ -1,6 +1,7 @@
 """What a teacher is, and everything that one of its decisions carries."""
 
 import dataclasses
+import json
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,12 @@ from rapid.scenarios import ACTIONS, NUM_ACTIONS
 
 Status = Literal["ok", "repaired", "fallback", "scripted"]
 STATUSES: tuple[str, ...] = typing.get_args(Status)
+NO_ANSWER = "no answer"
+"""How the error of a decision begins to which nobody gave an answer, usable or not."""
+
+
+class UnreachableError(RapidError):
+    """The model's server gives no answers; what was decided meanwhile was decided by nobody who was asked."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +30,7 @@ class Decision:
     action: int
     """Index into :data:`rapid.scenarios.ACTIONS`."""
     explanation: str = ""
-    """The reason given; it is fed back at the next step."""
+    """The driver's own reason, empty if it gave none; it is fed back at the next step."""
     answer: str = ""
     """The answer as the model gave it."""
     probabilities: tuple[float, ...] | None = None
@@ -44,8 +51,17 @@ class Decision:
     """Time taken; in a batch, the batch's time over its size."""
     cost: float = 0.0
     """Price, in the currency of the settings."""
-    transcript: str = ""
-    """What was said: the prompt (without the part that never changes) and all turns."""
+    turns: str = ""
+    """Everything said after `told`, as a JSON list of messages: answers, results of tools, the request to repair."""
+    told: str = ""
+    """What the model was told first, without the part of the prompt that never changes."""
+    computed: str = ""
+    """What RAPID itself computed about the action; no model said it."""
+
+    @property
+    def unanswered(self) -> bool:
+        """Whether the rule had to decide because no answer came at all."""
+        return self.status == "fallback" and self.error.startswith(NO_ANSWER)
 
 
 class Teacher(Protocol):
@@ -87,6 +103,9 @@ def from_record(record: dict[str, Any]) -> Decision:
     Raises:
         RapidError: fields are missing or unknown, or a value is out of range.
     """
+    if "transcript" in record:
+        told, turns = split_transcript(record["transcript"])
+        record = {name: value for name, value in record.items() if name != "transcript"} | {"told": told, "turns": turns}
     names = {field.name for field in dataclasses.fields(Decision)}
     if unknown := set(record) - names:
         raise RapidError(
@@ -105,3 +124,17 @@ def from_record(record: dict[str, Any]) -> Decision:
             raise RapidError(f"A recorded decision has {len(probabilities)} probabilities; expected {NUM_ACTIONS}.")
     values: dict[str, Any] = {**record, "probabilities": probabilities}
     return Decision(**values)
+
+
+def split_transcript(transcript: Any) -> tuple[str, str]:
+    """Return what was told and the turns after it, of a transcript as decisions had it until version 0.1.
+
+    Raises:
+        RapidError: it is no transcript.
+    """
+    try:
+        messages = json.loads(transcript or "[]")
+        told = str(messages[0]["content"]) if messages else ""
+    except (ValueError, TypeError, KeyError, IndexError) as error:
+        raise RapidError(f"A recorded decision has a transcript that is no list of messages: {error}.") from error
+    return told, json.dumps(messages[1:]) if messages else ""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rapid.teacher import int8
-from rapid.teacher.briefing import is_finished
+from rapid.teacher.calls import is_finished
 from rapid.teacher.chat import Message, Reply, Request
 
 ROWS = 16

@@ -35,7 +35,7 @@ def action_probabilities(tokens: Sequence[Token], action: int, available: Sequen
     """
     written = "".join(token.text for token in tokens)
     values = list(_VALUE.finditer(written))
-    start = values[-1].end() if values else _last_word(written, WORDS[action])
+    start = values[-1].end() if values else _only_word(written, WORDS[action])
     if start is None:
         return None
     masses = [0.0] * NUM_ACTIONS
@@ -52,9 +52,10 @@ def action_probabilities(tokens: Sequence[Token], action: int, available: Sequen
     return tuple(mass / total for mass in masses) if masses[action] > 0 else None
 
 
-def _last_word(text: str, word: str) -> int | None:
-    found = list(re.finditer(rf"\b{word}\b", text, re.IGNORECASE))
-    return found[-1].start() if found else None
+def _only_word(text: str, word: str) -> int | None:
+    """Return where the word stands after the thinking; None if it stands there twice: either may be the decision."""
+    found = list(re.finditer(rf"\b{word}\b", text[text.rfind("</think>") + 1 :], re.IGNORECASE))
+    return text.rfind("</think>") + 1 + found[0].start() if len(found) == 1 else None
 
 
 def _action_begun(text: str) -> int | None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rapid.scenarios import SLOWER
-from rapid.teacher.briefing import Choice, read_choice
+from rapid.teacher.answers import Choice, read_choice
 from rapid.teacher.decision import Decision
 from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts
@@ -65,7 +65,9 @@ def reflection_prompt(facts_T: Sequence[Facts], decisions: Sequence[Decision], s
     for past in range(max(count - SHOWN, 0), count):
         decision = decisions[past]
         lines.append(f"{_seconds(count - past)} before the crash: {describe(facts_T[past])}")
-        lines.append(f"Decision: {WORDS[decision.action]}, because {quote(decision.explanation)}")
+        # The rule's words are not the driver's.
+        said = "" if decision.status == "fallback" else decision.explanation
+        lines.append(f"Decision: {WORDS[decision.action]}" + (f", because {quote(said)}" if said else ""))
     lines.append(
         f"What went wrong? Which action should have been chosen {_seconds(count - step)} before the crash, where "
         f"{WORDS[decisions[step].action]} was, and what is the lesson for situations like it?"
@@ -73,9 +75,9 @@ def reflection_prompt(facts_T: Sequence[Facts], decisions: Sequence[Decision], s
     return Prompt(system, "\n".join(lines))
 
 
-def read_lesson(text: str, facts: Facts) -> Choice:
-    """Read the answer to a reflection; the lesson is the choice's explanation."""
-    choice = read_choice(text, facts, "react", "lesson")
+def read_lesson(text: str, facts: Facts, cut: bool = False) -> Choice:
+    """Read the answer to a reflection, which may have been cut off; the lesson is the choice's explanation."""
+    choice = read_choice(text, facts, "lesson", words=False, cut=cut, tools=False)
     if choice.action is not None and not choice.explanation.strip():
         return Choice(None, fault="The answer holds no lesson.")
     return choice

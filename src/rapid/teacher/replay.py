@@ -21,7 +21,10 @@ from rapid.teacher.memory import Memory, identify, show
 from rapid.teacher.prompt import digest
 from rapid.teacher.scene import read_scenes
 
-_FIELDS = ("action", "explanation", "answer", "prompt_hash", "status", "error", "retries", "transcript")
+_FIELDS = (
+    *("action", "explanation", "answer", "told", "computed", "turns", "transcript"),
+    *("prompt_hash", "status", "error", "retries"),
+)
 """What is repeated of a row of a Parquet log; tokens and cost were paid once."""
 
 
