@@ -165,7 +165,8 @@ def test_a_log_of_an_older_version_tells_what_was_told_from_what_was_computed():
             "answer": answers,
             "explanation": ["keep: safe, 9 m", reason, "no usable answer; keep leaves most room", "the road is free"],
             "status": ["ok", "repaired", "fallback", "scripted"],
-            "transcript": [json.dumps([*told, {"role": "assistant", "content": answer}]) for answer in answers[:3]] + [""],
+            "transcript": [json.dumps([*told, {"role": "assistant", "content": answer}]) for answer in answers[:3]]
+            + [""],
         }
     )
     rows = current_log(old).to_pylist()

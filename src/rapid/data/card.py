@@ -84,8 +84,8 @@ _READING = (
     "- `transitions.parquet`: one row a step. `obs` is 15 vehicles × 5 features (presence, x, y, vx, vy; metres and "
     "m/s, absolute), row 0 the ego. `next_obs` is null where it equals the `obs` of the next row. `terminated` is a "
     "crash, `truncated` the clock. `source` 0 is the teacher, 1 the random driver.",
-    "- `teacher_log.parquet`: one row a decision. What the model was told first (`told`), what it answered (`answer`, and "
-    "its own reason, `explanation`) and what RAPID computed about the action (`computed`) are three columns; `turns` "
-    "holds everything said after `told`, as JSON. Beside them: prompt hash, status, error, tokens, seconds.",
+    "- `teacher_log.parquet`: one row a decision. What the model was told first (`told`), what it answered (`answer`, "
+    "and its own reason, `explanation`) and what RAPID computed about the action (`computed`) are three columns; "
+    "`turns` holds everything said after `told`, as JSON. Beside them: prompt hash, status, error, tokens, seconds.",
     "- `memory.jsonl`, if the teacher has a memory: one line an experience, those that it had first.",
 )

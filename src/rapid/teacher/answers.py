@@ -50,11 +50,13 @@ _LABELLED = re.compile(
 )
 _HEADING = re.compile(rf"{_BEFORE}{_LABEL}{_AFTER}", re.IGNORECASE)
 _CHOSEN = re.compile(
-    r"(?:^|(?<=[.!;:,]\s)|\b(?:so|thus|therefore|hence)\s)\W*I(?:'ll|’ll| will| shall)? ?(?:choose|chose|select|pick|take"
-    rf"|decide on|decide|go with|opt for)(?: to)?(?: go| drive)?(?: the)?(?: action)?\W{{1,3}}{_WORD}(.*)",
+    r"(?:^|(?<=[.!;:,]\s)|\b(?:so|thus|therefore|hence)\s)\W*I(?:['’]ll| will| shall)? ?(?:choose|chose|select|pick"
+    rf"|take|decide on|decide|go with|opt for)(?: to)?(?: go| drive)?(?: the)?(?: action)?\W{{1,3}}{_WORD}(.*)",
     re.IGNORECASE,
 )
-_OPENING = re.compile(rf"{_BEFORE}{_WORD}[\s\"'”’`*_)\]]*(?:[.:,;!(–—-]|\bbecause\b|\bas\b|\bsince\b)(.*)", re.IGNORECASE)
+_OPENING = re.compile(
+    rf"{_BEFORE}{_WORD}[\s\"'”’`*_)\]]*(?:[.:,;!(–—-]|\bbecause\b|\bas\b|\bsince\b)(.*)", re.IGNORECASE
+)
 _TAGGED = re.compile(r"<(action|answer|decision|output)>\s*(.*?)\s*</\1>", re.IGNORECASE | re.DOTALL)
 _BOXED = re.compile(r"\$*\\boxed\{(?:\\text(?:bf)?\{)?\s*([\w ]+?)\s*\}{1,2}\$*")
 
@@ -62,7 +64,7 @@ _BOXED = re.compile(r"\$*\\boxed\{(?:\\text(?:bf)?\{)?\s*([\w ]+?)\s*\}{1,2}\$*"
 _HARMLESS = re.compile(
     r"\b(?:left|right)(?:most)?(?:-hand)? (?:lane|side)\b|\b(?:on|to|from) (?:the|my) (?:left|right)\b"
     r"|\bno (?:other )?(?:cars?|vehicles?|traffic|conflicts?|risks?|dangers?|crash|collisions?|obstacles?|one)\b"
-    r"|\b(?:to |and )?(?:avoid|prevent)(?:s|ing)? (?:an? |the |any )?(?:\w+ )?(?:crash|collisions?|accidents?|risks?)\b",
+    r"|\b(?:to |and )?(?:avoid|prevent)(?:s|ing)? (?:an? |the |any )?(?:\w+ )?(?:crash|collisions?|risks?)\b",
     re.IGNORECASE,
 )
 _DOUBT = re.compile(
@@ -102,7 +104,9 @@ def content_of(content: Any) -> tuple[str, str]:
             kind = str(fields.get("type", "text"))
             if kind in ("text", "output_text", "refusal"):
                 value = fields.get("text", fields.get("refusal"))
-                said += str(value.get("value", "")) if isinstance(value, dict) else value if isinstance(value, str) else ""
+                said += (
+                    str(value.get("value", "")) if isinstance(value, dict) else value if isinstance(value, str) else ""
+                )
             elif kind in ("thinking", "reasoning", "reasoning_content"):
                 thought += "".join(content_of(fields.get(kind, fields.get("text", fields.get("content")))))
     return said, thought
@@ -300,7 +304,7 @@ def _support(rest: str, action: int) -> str:
 
 
 def _stands_alone(lines: list[str], number: int) -> bool:
-    """Say whether an action alone in a line is a sentence of its own, and not a part of one or of a list of examples."""
+    """Say whether an action alone in a line is a sentence of its own, not a part of one or an example."""
     before = [line for line in lines[:number] if line]
     if before and not (_LONE.fullmatch(before[-1]) or _HEADING.fullmatch(before[-1]) or _LABELLED.search(before[-1])):
         last = before[-1].rstrip("\"'`*_)]”’ ")

@@ -29,8 +29,8 @@ _FORMATS = {
 _REPAIRS = {
     "digest": _FORMATS["digest"],
     # No example: what stands in one is copied.
-    "react": 'Give your decision as a JSON object and nothing else. It has two keys: "explanation", your own reason in a '
-    'few words, and "action", one of the possible actions.',
+    "react": 'Give your decision as a JSON object and nothing else. It has two keys: "explanation", your own reason in '
+    'a few words, and "action", one of the possible actions.',
 }
 
 

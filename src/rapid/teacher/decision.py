@@ -105,7 +105,10 @@ def from_record(record: dict[str, Any]) -> Decision:
     """
     if "transcript" in record:
         told, turns = split_transcript(record["transcript"])
-        record = {name: value for name, value in record.items() if name != "transcript"} | {"told": told, "turns": turns}
+        record = {name: value for name, value in record.items() if name != "transcript"} | {
+            "told": told,
+            "turns": turns,
+        }
     names = {field.name for field in dataclasses.fields(Decision)}
     if unknown := set(record) - names:
         raise RapidError(
