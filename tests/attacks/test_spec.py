@@ -26,6 +26,10 @@ VALUES = {
     "start": st.sampled_from(["clean", "random"]),
     "loss": st.sampled_from(["ce", "margin", "dlr", "min-q", "mad"]),
     "keep": st.sampled_from(["best", "last"]),
+    "target": st.sampled_from(["faster", "idle", "sideways", "slower"]),
+    "to": st.sampled_from(["far", "near", "left", "right", "drawn"]),
+    "queries": st.integers(1, 1000),
+    "coupling": st.floats(0, 2),
 }
 
 
@@ -37,6 +41,8 @@ def specs(draw):
     changes = {key: draw(VALUES[key]) for key in some}
     if changes.get("norm") == "l2" or "radius" in changes:
         changes = {key: value for key, value in changes.items() if key not in ("metres", "speed")}
+    if "source" in fields_of(kind):
+        changes["source"] = draw(st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"]), min_size=1))
     return AttackSpec(kind, **(defaults_of(kind) | changes))
 
 
@@ -62,6 +68,7 @@ def test_options_change_what_they_name_and_nothing_else():
     assert spec == AttackSpec("pgd", steps=50, restarts=5, radius=0.02, loss="margin")
     assert spec.keep == "best"
     assert parse_attack("pgd:steps=50").name == "pgd:steps=50"  # not the paper's
+    assert parse_attack("transfer:runs/a b,ego=trusted").source == "runs/a b"
     assert with_options(spec, "ego=trusted") == dataclasses.replace(spec, ego="trusted")
 
 
@@ -102,6 +109,9 @@ def test_sizes_are_told_in_metres():
         ("pgd:norm=l2,metres=1", "half widths of a box"),
         ("uniform:steps=3", "attack of kind 'uniform' has radius"),
         ("none:radius=1", "has no options"),
+        ("transfer", "needs a source: write transfer:DIRECTORY"),
+        ("lie:to=nea", "did you mean 'near'"),
+        ("square:norm=l2", "attack of kind 'square' has loss, queries"),
     ],
 )
 def test_mistakes_are_explained(text, match):

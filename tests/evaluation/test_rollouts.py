@@ -1,7 +1,7 @@
 """Rollouts: finished worlds count no further, the true observation is measured, noise is each episode's own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +12,9 @@ import torch
 
 import rapid
 from rapid.agents.open import kind_of, open_agent
+from rapid.attacks.attack import Base, Needs
 from rapid.attacks.draws import uniform
+from rapid.attacks.spec import AttackSpec
 from rapid.errors import RapidError
 from rapid.evaluation import rollouts
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
@@ -22,12 +24,12 @@ from rapid.scenarios import FASTER, IDLE, LANE_RIGHT
 SCENARIO = "lane-3-density-2"
 
 
-@dataclass
-class Noise:
+class Noise(Base):
     """Adds uniform noise to every feature."""
 
-    needs_gradient: bool = False
-    name: str = "noise"
+    def __init__(self, needs: Needs = "nothing", label: str = "noise") -> None:
+        super().__init__(AttackSpec("uniform", label=label), None)
+        self.needs = needs
 
     def __call__(self, network: Any, obs_BVF: torch.Tensor, source: Sequence[torch.Generator]) -> torch.Tensor:
         return obs_BVF + uniform(obs_BVF.shape, source)
@@ -108,7 +110,7 @@ def test_noise_of_an_episode_does_not_depend_on_its_company(toy) -> None:
 
 
 def test_gradient_attack_needs_a_network(toy, constant) -> None:
-    attack = Noise(needs_gradient=True, name="pgd")
+    attack = Noise("gradient", "pgd")
     assert not is_applicable(constant(IDLE), attack)
     assert is_applicable(Watcher(), attack)
     assert is_applicable(constant(IDLE), "none")
@@ -186,7 +188,9 @@ def test_tracks_follow_vehicles_through_changes_of_rank() -> None:
 
 def test_rows_of_cells_that_do_not_apply_are_left_out(toy, constant, monkeypatch) -> None:
     monkeypatch.setattr(
-        rollouts, "_resolve", lambda a, lanes: (a, None if a == "none" else Noise(needs_gradient=a == "pgd", name=a))
+        rollouts,
+        "_resolve",
+        lambda a, lanes: (a, None if a == "none" else Noise("gradient" if a == "pgd" else "nothing", a)),
     )
     done: list[float] = []
     rows = evaluate_agent(constant(IDLE), SCENARIO, [10, 11], ("none", "uniform", "pgd"), progress=done.append)

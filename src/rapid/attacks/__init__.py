@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 from rapid.attacks.spec import NAMED, AttackSpec, as_spec, parse_attack
 
 if TYPE_CHECKING:
-    from rapid.attacks.registry import Attack as Attack
+    from rapid.attacks.attack import Attack as Attack
     from rapid.attacks.registry import get_attack as get_attack
 
 __all__ = ["NAMED", "Attack", "AttackSpec", "as_spec", "get_attack", "parse_attack"]
 
-_HOME = {"Attack": "rapid.attacks.registry", "get_attack": "rapid.attacks.registry"}
+_HOME = {"Attack": "rapid.attacks.attack", "get_attack": "rapid.attacks.registry"}
 
 
 def __getattr__(name: str) -> Any:

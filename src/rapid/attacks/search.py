@@ -8,7 +8,7 @@ or more runs try all that fewer do and then some, so the loss found never falls 
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -34,10 +34,14 @@ class Ball:
     """In normalised features."""
     scale_VF: Tensor
     """What 1 means in each normalised feature of each row; 0 where nothing may move."""
+    before_BVF: Tensor | None = None
+    """Offsets of the step before, from which those of this one may differ by"""
+    coupling: float = 0.0
+    """at most so much in each feature (`linf` only)."""
 
-    def to(self, device: torch.device) -> "Ball":
-        """Return it on a device."""
-        return Ball(self.norm, self.radius, self.scale_VF.to(device))
+    def take(self, rows_R: Tensor) -> "Ball":
+        """Return it for some of the observations."""
+        return self if self.before_BVF is None else replace(self, before_BVF=self.before_BVF[rows_R])
 
     def at(self, obs_BVF: Tensor, offset_BVF: Tensor) -> Tensor:
         """Return the observations at an offset, untouched where nothing may move."""
@@ -46,6 +50,9 @@ class Ball:
     def project(self, offset_BVF: Tensor) -> Tensor:
         """Return the nearest offset inside."""
         radius = self.radius * (1 - ROUNDING)
+        if self.before_BVF is not None:
+            nearby_BVF = offset_BVF - self.before_BVF
+            offset_BVF = self.before_BVF + nearby_BVF.clamp(-self.coupling, self.coupling)
         if self.norm == "linf":
             return offset_BVF.clamp(-radius, radius)
         length_B11 = offset_BVF.square().sum((1, 2), keepdim=True).sqrt()
@@ -182,15 +189,15 @@ def ascend(values: Values, obs_BVF: Tensor, aim: Aim, ball: Ball, runs: Runs, so
         for run in range(runs.restarts):
             if len(rows_R) == 0:
                 break
-            some, true_RVF = aim.take(rows_R), obs_BVF[rows_R]
+            some, true_RVF, nearby = aim.take(rows_R), obs_BVF[rows_R], ball.take(rows_R)
             if run == 1 and fgsm_BVF is not None:
                 offset_RVF = fgsm_BVF[rows_R]
             elif run > 0 or runs.start == "random":
-                offset_RVF = ball.draw(true_RVF, chosen(source, rows_R.tolist()))
+                offset_RVF = nearby.draw(true_RVF, chosen(source, rows_R.tolist()))
             else:
-                offset_RVF = torch.zeros_like(true_RVF)
+                offset_RVF = nearby.project(torch.zeros_like(true_RVF))
             trace = _Trace(shown_BVF, best_B, reached_B, rows_R, runs.keep)
-            first_RVF = _climb(values, true_RVF, offset_RVF, some, ball, runs, trace)
+            first_RVF = _climb(values, true_RVF, offset_RVF, some, nearby, runs, trace)
             if run == 0 and runs.start == "clean":
                 fgsm_BVF = first_RVF
             rows_R = (~reached_B).nonzero().squeeze(1)
@@ -244,6 +251,7 @@ def _climb(
             if runs.stop and bool((done_R := trace.reached_B[trace.rows_R]).any()):
                 left_R = ~done_R
                 true_RVF, offset_RVF, aim = true_RVF[left_R], offset_RVF[left_R], aim.take(left_R)
+                ball = ball.take(left_R)
                 trace.rows_R = trace.rows_R[left_R]
                 if not len(true_RVF):
                     break

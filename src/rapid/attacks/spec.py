@@ -9,13 +9,16 @@ import dataclasses
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
+from urllib.parse import quote, unquote
 
 from rapid.errors import RapidError, did_you_mean
 
-Kind = Literal["none", "uniform", "gaussian", "fgsm", "pgd"]
+Kind = Literal["none", "uniform", "gaussian", "fgsm", "pgd", "directed", "square", "transfer", "lie", "coupled"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Norm = Literal["linf", "l2"]
 Loss = Literal["ce", "margin", "dlr", "min-q", "mad"]
+Target = Literal["faster", "idle", "sideways", "slower"]
+Lie = Literal["far", "near", "left", "right", "drawn"]
 
 LANE_WIDTH = 4.0
 """Metres."""
@@ -60,6 +63,18 @@ class AttackSpec:
     taken (as the agent's own critic has it), `mad` how far the policy moves from what it was (KL divergence)."""
     keep: Literal["best", "last"] = "best"
     """Which iterate is shown: the one with the largest loss, the true observation among them, or the last."""
+    target: Target = "faster"
+    """`directed`: the action that is wanted most; :data:`rapid.attacks.directed.ORDERS` has those that follow."""
+    queries: int = 200
+    """`square`: points tried for each observation."""
+    to: Lie = "far"
+    """`lie`: where all other cars are said to be, in every step alike: farther on and faster or less far and slower, to
+    the left or to the right, each by all of the radius and the ego the other way; or every number shifted by all of it,
+    up or down as is drawn once an episode."""
+    coupling: float = 0.2
+    """`coupled`: by what share of the ball's size the perturbation of a feature may change from step to step."""
+    source: str = ""
+    """`transfer`: the agent that is attacked instead of the one that drives."""
     label: str = field(default="", compare=False)
     """How tables call it, if not by its text."""
 
@@ -76,7 +91,8 @@ class AttackSpec:
         changed = [key for key in fields_of(self.kind) if getattr(self, key) != usual[key]]
         if not changed and self.kind in NAMED:  # the bare name is the paper's attack
             changed = [fields_of(self.kind)[0]]
-        words = [f"{key}={_text(getattr(self, key))}" for key in changed]
+        words = [quote(self.source, safe="/:~ ")] if self.source else []
+        words += [f"{key}={_text(getattr(self, key))}" for key in changed if key != "source"]
         return f"{self.kind}:{','.join(words)}" if words else self.kind
 
     @property
@@ -113,19 +129,38 @@ class AttackSpec:
         steps = f"{self.steps} steps{f' of {self.step:g}' if self.step else ''}"
         runs = f"{steps} × {self.restarts} runs" if self.restarts > 1 else steps
         loss = "" if self.loss == "ce" else f", loss {self.loss}"
-        return {"fgsm": f"{ball}, 1 step{loss}", "pgd": f"{ball}, {runs}{loss}"}[self.kind]
+        return {
+            "fgsm": f"{ball}, 1 step{loss}",
+            "pgd": f"{ball}, {runs}{loss}",
+            "directed": f"{ball}, towards {self.target.upper()}, {runs}",
+            "square": f"{ball}, without gradients, {self.queries} points{loss}",
+            "transfer": f"{ball}, made on {self.source}, {runs}{loss}",
+            "lie": f"the same lie in every step: {self.to}, within {units}",
+            "coupled": f"{ball}, changing by {self.coupling:.0%} of it a step at most, {runs}{loss}",
+        }[self.kind]
 
 
 _SIZE = ("radius", "metres", "speed", "presence", "ego")
+_RUNS = ("steps", "step", "restarts", "start", "norm", *_SIZE)
 _FIELDS: dict[Kind, tuple[str, ...]] = {
     "none": (),
     "uniform": _SIZE,
     "gaussian": _SIZE,
     "fgsm": ("loss", "keep", "norm", *_SIZE),
-    "pgd": ("steps", "step", "restarts", "start", "norm", *_SIZE, "loss", "keep"),
+    "pgd": (*_RUNS, "loss", "keep"),
+    "directed": ("target", *_RUNS),
+    "square": ("loss", "queries", *_SIZE),
+    "transfer": ("source", *_RUNS, "loss"),
+    "lie": ("to", *_SIZE),
+    "coupled": ("coupling", "steps", "step", "restarts", *_SIZE, "loss"),
 }
 
-_OWN_DEFAULTS: dict[Kind, dict[str, Any]] = {"uniform": {"radius": 0.2}, "gaussian": {"radius": 0.2}}
+_OWN_DEFAULTS: dict[Kind, dict[str, Any]] = {
+    "uniform": {"radius": 0.2},
+    "gaussian": {"radius": 0.2},
+    "directed": {"steps": 20, "restarts": 2},
+    "square": {"loss": "margin"},
+}
 
 
 def fields_of(kind: Kind) -> tuple[str, ...]:
@@ -181,9 +216,11 @@ def with_options(spec: AttackSpec, options: str) -> AttackSpec:
 def _read_options(text: str, kind: Kind, rest: str) -> dict[str, Any]:
     changes: dict[str, Any] = {}
     fields = fields_of(kind)
-    for word in rest.split(",") if rest.strip() else []:
+    for place, word in enumerate(rest.split(",") if rest.strip() else []):
         key, equals, value = (part.strip() for part in word.partition("="))
-        if not equals:
+        if not equals and place == 0 and "source" in fields:
+            key, value = "source", unquote(word.strip())
+        elif not equals:
             raise RapidError(f"The attack '{text}' has '{word.strip()}', but options are written name=value.")
         if key not in fields:
             raise RapidError(
@@ -219,6 +256,8 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "start": ("clean", "random"),
     "loss": get_args(Loss),
     "keep": ("best", "last"),
+    "target": get_args(Target),
+    "to": get_args(Lie),
 }
 _BOUNDS: dict[str, tuple[float, float]] = {
     "radius": (0, 10),
@@ -227,6 +266,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "steps": (1, 10_000),
     "step": (0, 10),
     "restarts": (1, 1000),
+    "queries": (1, 100_000),
+    "coupling": (0, 2),
 }
 
 
@@ -256,6 +297,11 @@ def _check(spec: AttackSpec) -> None:
         )
     if spec.norm == "l2" and (spec.metres or spec.speed):
         raise RapidError("metres and speed are half widths of a box: leave norm at 'linf', or give a radius instead.")
+    if spec.source == "" and "source" in fields_of(spec.kind):
+        raise RapidError(
+            f"An attack of kind '{spec.kind}' needs a source: write {spec.kind}:DIRECTORY, with the directory of the "
+            "agent that is attacked instead."
+        )
 
 
 _DEFAULT_VALUES: dict[str, Any] = {item.name: item.default for item in dataclasses.fields(AttackSpec)}

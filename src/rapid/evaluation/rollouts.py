@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 import rapid
 from rapid.agents.open import check_road, driver_for, kind_of
+from rapid.attacks.attack import Attack, network_of, offers
 from rapid.attacks.spec import AttackSpec, parse_attack
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, Kind
 from rapid.evaluation.recording import Recording
-from rapid.evaluation.worlds import AttackLike, Perturbation, Worlds
+from rapid.evaluation.worlds import Perturbation, Worlds
 from rapid.scenarios import NUM_VEHICLES, get_scenario, seeing
 from rapid.simulator import Simulator
 
@@ -86,22 +86,21 @@ class Episodes:
         ]
 
 
-def is_applicable(agent: Any, attack: AttackLike | AttackSpec | str | None) -> bool:
+def is_applicable(agent: Any, attack: Attack | AttackSpec | str | None) -> bool:
     """Whether the attack can be made on the agent.
 
-    A gradient attack needs the agent's network; and an agent that reads the worlds themselves sees no observation.
+    A gradient attack needs the agent's network, some others its Q-values; and an agent that reads the worlds themselves
+    sees no observation.
     """
     resolved = _resolve(attack, lanes=1)[1]
-    if resolved is None:
-        return True
-    return not callable(getattr(agent, "bind", None)) and (not resolved.needs_gradient or _network(agent) is not None)
+    return resolved is None or resolved.needs in offers(agent)
 
 
 def run_episodes(
     agent: Any,
     scenario: str,
     seeds: Sequence[int],
-    attack: AttackLike | AttackSpec | str | None = None,
+    attack: Attack | AttackSpec | str | None = None,
     generator_seed: int = 0,
     record: bool = False,
     simulator: Simulator = "compiled",
@@ -123,11 +122,11 @@ def run_episodes(
     lanes = get_scenario(scenario).lanes
     check_road(agent, scenario)
     attack_name, resolved = _resolve(attack, lanes)
-    network = _network(agent)
     if not is_applicable(agent, resolved):
         raise RapidError(
-            f"The attack '{attack_name}' cannot be made on '{_name(agent)}': a gradient attack needs a network, and an "
-            "agent that reads the worlds themselves sees no observation. Leave this cell out: it is not applicable."
+            f"The attack '{attack_name}' cannot be made on '{_name(agent)}': a gradient attack needs a network, one by "
+            "search the values of the actions, and an agent that reads the worlds themselves sees no observation. "
+            "Leave this cell out: it is not applicable. Noise, lies and transfer work on all that read observations."
         )
     vehicles = getattr(agent, "vehicles", NUM_VEHICLES)
     shown = seeing(max(vehicles, NUM_VEHICLES))
@@ -138,7 +137,7 @@ def run_episodes(
         env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, config=shown, autoreset=False)
         try:
             driver = driver_for(agent, env, generator_seed)
-            perturbation = Perturbation(resolved, network, generator_seed, worlds.seed_B)
+            perturbation = Perturbation(resolved, agent, scenario, worlds.seed_B, generator_seed)
             worlds.drive(env, driver, perturbation, lanes, progress, vehicles)
         finally:
             env.close()
@@ -163,7 +162,7 @@ def run_episodes(
         counts_EA=joined("counts_BA"),
         decision_seconds=sum(part.decision_seconds for part in parts),
         kind=kind_of(agent),
-        has_network=network is not None,
+        has_network=network_of(agent) is not None,
         gradient_attack=resolved is not None and resolved.needs_gradient,
     )
     for part in parts:
@@ -200,12 +199,7 @@ def _name(agent: Any) -> str:
     return str(getattr(agent, "name", type(agent).__name__))
 
 
-def _network(agent: Any) -> torch.nn.Module | None:
-    network = getattr(agent, "network", None)
-    return network if isinstance(network, torch.nn.Module) else None
-
-
-def _resolve(attack: AttackLike | AttackSpec | str | None, lanes: int) -> tuple[str, AttackLike | None]:
+def _resolve(attack: Attack | AttackSpec | str | None, lanes: int) -> tuple[str, Attack | None]:
     """Return the attack's name and the attack on a road with `lanes` lanes; None is no attack."""
     if isinstance(attack, str):
         attack = parse_attack(attack)
@@ -215,4 +209,4 @@ def _resolve(attack: AttackLike | AttackSpec | str | None, lanes: int) -> tuple[
         from rapid.attacks.registry import get_attack
 
         return attack.shown, get_attack(attack, lanes)
-    return str(getattr(attack, "name", type(attack).__name__)), attack
+    return attack.name, attack

@@ -156,7 +156,7 @@ def drive_teacher(
         env = rapid.make_vec(scenario, len(worlds.seed_B), simulator=simulator, autoreset=False)
         try:
             listener = _Listener(driver_for(teacher, env, generator_seed), len(worlds.seed_B), duration, progress)
-            calm = Perturbation(None, None, generator_seed, worlds.seed_B)
+            calm = Perturbation(None, teacher, scenario, worlds.seed_B, generator_seed)
             worlds.drive(env, listener, calm, lanes, listener.ended)
         finally:
             env.close()

@@ -1,15 +1,16 @@
 """Worlds under way side by side, and what is measured of them step by step."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from rapid.agents.open import Driver
+from rapid.attacks.attack import Attack, Field, Shown, network_of, values_of
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import time_to_collision
 from rapid.evaluation.recording import Recording
@@ -17,35 +18,26 @@ from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS, NUM_VEHICLES
 from rapid.seeding import torch_stream
 
 
-class AttackLike(Protocol):
-    """What an attack must be (see `rapid.attacks`)."""
-
-    @property
-    def needs_gradient(self) -> bool:
-        """Whether the agent's network is differentiated."""
-        ...
-
-    def __call__(self, network: Any, obs_BVF: torch.Tensor, source: Sequence[torch.Generator]) -> torch.Tensor:
-        """Return what the agent sees instead; what is drawn for observation i comes from generator i."""
-        ...
-
-
 class Perturbation:
-    """An attack, the network it reads and one random stream per episode, so that nothing depends on the batch."""
+    """An attack on an agent in some worlds, with one random stream per episode: nothing depends on the batch."""
 
     def __init__(
-        self, attack: AttackLike | None, network: torch.nn.Module | None, seed: int, spawns: NDArray[np.int64]
+        self, attack: Attack | None, agent: Any, scenario: str, seeds: NDArray[np.int64], generator_seed: int
     ) -> None:
-        self.attack, self.network = attack, network
-        self._streams = [torch_stream(seed, f"attack/{spawn}") for spawn in spawns] if attack is not None else []
+        self._shown: Shown | None = None
+        if attack is None:
+            return
+        network = network_of(agent)
+        self._device = torch.device("cpu") if network is None else next(network.parameters()).device
+        streams = [torch_stream(generator_seed, f"attack/{seed}") for seed in seeds]
+        self._shown = attack.begin(Field(agent, values_of(agent), streams, scenario, seeds.tolist()))
 
-    def __call__(self, obs_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> NDArray[np.float32]:
-        if self.attack is None:
+    def __call__(self, obs_BVF: NDArray[np.float32], worlds: NDArray[np.int64], env: Any) -> NDArray[np.float32]:
+        """Return what is shown of the true observations of `worlds`; `env` holds all of them."""
+        if self._shown is None:
             return obs_BVF
-        obs = torch.from_numpy(np.ascontiguousarray(obs_BVF))
-        if self.attack.needs_gradient and self.network is not None:
-            obs = obs.to(next(self.network.parameters()).device)
-        seen = self.attack(self.network, obs, [self._streams[world] for world in worlds])
+        obs = torch.from_numpy(np.ascontiguousarray(obs_BVF)).to(self._device)
+        seen = self._shown(obs, worlds, env)
         return seen.detach().cpu().numpy().astype(np.float32, copy=False)
 
 
@@ -83,7 +75,7 @@ class Worlds:
         while alive_B.any():
             worlds = np.flatnonzero(alive_B)
             seen_BVF = obs_BVF[:, :vehicles].copy()
-            seen_BVF[worlds] = perturb(seen_BVF[worlds], worlds)
+            seen_BVF[worlds] = perturb(seen_BVF[worlds], worlds, env)
             began = time.perf_counter()
             chosen = driver.choose(seen_BVF, worlds, self.seed_B, step)
             self.decision_seconds += time.perf_counter() - began
