@@ -12,9 +12,10 @@ import pytest
 from samples import HOSTILE, SCENARIO, full, recording, rows
 
 from rapid.errors import RapidError
+from rapid.pages.episodes import moving_picture
+from rapid.pages.markup import script_json, tag, text
 from rapid.report import ReportData, text_summary, write_figures, write_report
-from rapid.report.curves import UNIFORM, charts, moving_picture, series
-from rapid.report.markup import script_json, tag, text
+from rapid.report.curves import UNIFORM, charts, series
 from rapid.report.page import page
 
 VOID = {"meta", "img", "br", "input", "hr", "link"}
@@ -66,7 +67,7 @@ def test_text_of_others_stays_text() -> None:
     content = page(full(HOSTILE))
     reader = Reader(content)
     clean = HOSTILE.replace("\ud800", "?")
-    assert json.loads(reader.scripts[0])["episodes"][0]["said"] == [clean] * 3
+    assert json.loads(reader.scripts[0])["episodes"][0]["answered"] == [clean] * 3
     assert clean in " ".join(reader.words)
     assert not any(name == "img" or any(key.startswith("on") for key in attributes) for name, attributes in reader.tags)
     assert "\u2028" not in reader.scripts[0]

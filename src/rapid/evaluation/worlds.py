@@ -85,7 +85,7 @@ class Worlds:
             if self._steps is not None:
                 said = driver.commentary(seen_BVF, worlds)
                 for i, world in enumerate(worlds):
-                    self._steps[world].append(_Step(obs_BVF[world].copy(), int(chosen[i]), *said[i]))
+                    self._steps[world].append(_Step(obs_BVF[world].copy(), int(chosen[i]), *said[i], seen_BVF[world]))
             # Copied: an environment may write its next observation into the same memory.
             obs_BVF, reward_B, terminated_B, truncated_B, info = env.step(action_B)
             obs_BVF = np.array(obs_BVF, np.float32)
@@ -134,6 +134,7 @@ class Worlds:
                     crashed=bool(self.crashed_B[world]),
                     q_TA=np.stack([q for q in values if q is not None]) if values[0] is not None else None,
                     explanations=tuple(step.said for step in steps) if any(step.said for step in steps) else (),
+                    seen_TVF=None if attack == "none" else np.stack([step.seen_VF for step in steps]),
                 )
             )
         return found
@@ -147,6 +148,7 @@ class _Step:
     action: int
     q_A: NDArray[np.float32] | None
     said: str
+    seen_VF: NDArray[np.float32]
     reward: float = 0.0
     after: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 

@@ -10,7 +10,7 @@ from rapid.config import Config
 from rapid.config_io import to_dict
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
-from rapid.evaluation.recording import save_recordings
+from rapid.evaluation.recording import Recording, explained_by, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
 from rapid.files import read_json, sha256, write_json, write_text
@@ -33,6 +33,8 @@ PLANNER = "planner"
 """Search with the simulator itself as its model: a reference, no bound."""
 RECORDED = 4
 """Episodes of the adapted agent, and of the teacher, that the report can play."""
+CRASHES = {"RAPID": 2}
+"""Crashes of an agent under each attack that the report can play; of other learned agents, one."""
 
 
 def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
@@ -103,8 +105,12 @@ def measure(
             if labels and spec in labels:
                 agent.name = labels[spec]
             episodes = _drive(config, scenario, spec, agent)
-            if recordings := [recording for of in episodes for recording in of.recordings[:RECORDED]]:
-                save_recordings(part.with_suffix(".recordings.json"), recordings)
+            recordings = [recording for of in episodes for recording in of.recordings[:RECORDED]]
+            recordings += _crashes(config, agent, episodes)
+            if recordings:
+                save_recordings(
+                    part.with_suffix(".recordings.json"), [explained_by(agent, each) for each in recordings]
+                )
             source = commit()
             save_rows(
                 part, [row for of in episodes for row in of.rows(config.seed if of.has_network else None, source)]
@@ -137,6 +143,28 @@ def _drive(config: Config, scenario: str, spec: str, agent: Any) -> list[Episode
             )
             for attack in attacks
         ]
+
+
+def _crashes(config: Config, agent: Any, measured: Sequence[Episodes]) -> list[Recording]:
+    """Drive the first crashes of a learned agent again, under each attack, to keep what happened step by step."""
+    found: list[Recording] = []
+    for of in measured:
+        known = {recording.seed for recording in of.recordings[:RECORDED]}
+        seeds = [int(seed) for seed in of.seed_E[of.crashed_E] if int(seed) not in known]
+        seeds = seeds[: CRASHES.get(of.agent, 1)] if of.kind == "learned" else []
+        if seeds:
+            again = run_episodes(
+                agent,
+                of.scenario,
+                seeds,
+                of.attack,
+                generator_seed=config.seed,
+                record=True,
+                simulator=config.simulator,
+            )
+            # An attack that draws for all worlds at once may spare a car that it made crash among others.
+            found += [recording for recording in again.recordings if recording.crashed]
+    return found
 
 
 def learning_curve(config: Config, scenario: str, name: str) -> Callable[[QNetwork, int], dict[str, float]] | None:

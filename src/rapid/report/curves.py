@@ -1,4 +1,4 @@
-"""What the page's script draws: learning curves and the moving pictures, as plain data."""
+"""The learning curves that the page's script draws, as plain data."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,11 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rapid.evaluation.recording import Recording
-from rapid.evaluation.summary import label_of
+from rapid.pages.episodes import ACTION_WORDS
 from rapid.report.data import Entries
-from rapid.report.tables import ACTION_WORDS
-from rapid.scenarios import get_scenario
 
 UNIFORM = math.log(len(ACTION_WORDS))
 """ln 5 = 1.609: the cross-entropy of a policy that gives every action the same probability."""
@@ -103,29 +100,3 @@ def charts(distill: Mapping[str, Entries], adapt: Mapping[str, Entries]) -> list
 def _only(entry: Mapping[str, Any], term: str) -> dict[str, Any]:
     """Return the time of a record and one of its terms, as `value`."""
     return {name: entry[name] for name in _TIMES if name in entry} | ({"value": entry[term]} if term in entry else {})
-
-
-def moving_picture(recording: Recording) -> dict[str, Any]:
-    """Return one episode for the player: for each step the vehicles as [track, row, x, y, vx, vy]."""
-    tracks = recording.tracks()
-    frames = [
-        [
-            [int(tracks[t, row]), row, *(round(float(value), 2) for value in scene[row, 1:5])]
-            for row in np.flatnonzero(tracks[t] >= 0).tolist()
-        ]
-        for t, scene in enumerate(recording.obs_TVF)
-    ]
-    attacked = "" if recording.attack == "none" else f", {recording.attack}"
-    ending = "crash" if recording.crashed else "no crash"
-    reward = float(np.nansum(recording.reward_T))
-    return {
-        "label": f"{label_of(recording.agent)}{attacked}, spawn {recording.seed}: return {reward:.1f}, {ending}",
-        "agent": label_of(recording.agent),
-        "lanes": get_scenario(recording.scenario).lanes,
-        "crashed": recording.crashed,
-        "frames": frames,
-        "actions": recording.action_T.tolist(),
-        "rewards": [round(float(reward), 4) for reward in recording.reward_T],
-        "q": None if recording.q_TA is None else [[round(float(v), 4) for v in row] for row in recording.q_TA],
-        "said": list(recording.explanations),
-    }

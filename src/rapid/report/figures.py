@@ -16,9 +16,9 @@ from rapid.evaluation.statistics import Estimate
 from rapid.evaluation.summary import SummaryRow, label_of, summarize, units
 from rapid.evaluation.teacher_summary import TeacherSummary
 from rapid.files import atomic_path
+from rapid.pages.episodes import ACTION_WORDS
 from rapid.report.curves import UNIFORM, series
 from rapid.report.data import Entries, ReportData, paper_return
-from rapid.report.tables import ACTION_WORDS
 from rapid.scenarios import get_scenario
 
 _ACCENT, _SOFT, _PAPER, _ROAD = "#1f6f8b", "#8a939b", "#a4490f", "#e4e6e6"

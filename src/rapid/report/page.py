@@ -1,20 +1,17 @@
 """The page: one HTML file with everything in it, which opens from disk and asks the network for nothing."""
 
-import base64
-import hashlib
 import os
-import re
-from importlib import resources
 from pathlib import Path
 
 from rapid.evaluation.summary import summarize, summary_text
 from rapid.files import write_text
+from rapid.pages import PLAYER, fill_page
+from rapid.pages.episodes import ACTION_WORDS, side_by_side
+from rapid.pages.markup import join, tag
 from rapid.report import sections
-from rapid.report.curves import charts, moving_picture
+from rapid.report.curves import charts
 from rapid.report.data import ReportData
-from rapid.report.markup import Markup, join, script_json, tag, text
 from rapid.report.routing import routing
-from rapid.report.tables import ACTION_WORDS
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
 
@@ -34,7 +31,7 @@ def page(run: ReportData) -> str:
     """Return the page of a run as HTML."""
     summaries = summarize(run.rows)
     curves = charts(run.distill, run.adapt)
-    pictures = [moving_picture(recording) for recording in run.recordings if len(recording.action_T)]
+    pictures = side_by_side(run.recordings)
     lanes = get_scenario(str(run.settings.get("scenario", PAPER_SCENARIOS[0]))).lanes
     body = join(
         [
@@ -45,7 +42,8 @@ def page(run: ReportData) -> str:
                 "Watch it drive",
                 bool(pictures),
                 "The road from above, moving with the ego; the numbers are ranks by distance, as the teacher names the "
-                "cars. Space plays and pauses, the arrow keys step.",
+                "cars. A car's colour says how much of the decision about it is policy 1's, which was distilled, and "
+                "how much the adapter's. Space plays and pauses, the arrow keys step, c goes to the crash.",
                 "No episode was recorded.",
             ),
             sections.attacks(run, summaries),
@@ -63,30 +61,10 @@ def page(run: ReportData) -> str:
             tag("details", tag("summary", "The summary as plain text"), tag("pre", summary_text(run.rows))),
         ]
     )
-    script = _file("page.js")
-    return _fill(
-        _file("page.html"),
-        title=text(run.title),
-        # The script's own hash: no other script runs here, whatever text found its way into the page.
-        policy=text(
-            f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{_hash(script)}'; img-src data:; "
-            "base-uri 'none'; form-action 'none'"
-        ),
-        style=Markup(_file("page.css")),
-        body=body,
-        payload=script_json({"actions": ACTION_WORDS, "charts": curves, "episodes": pictures}),
-        script=Markup(script),
+    return fill_page(
+        run.title,
+        body,
+        {"actions": ACTION_WORDS, "charts": curves, "episodes": pictures},
+        scripts=(*PLAYER, "tables.js", "charts.js", "report.js"),
+        styles=("base.css", "report.css", "player.css"),
     )
-
-
-def _file(name: str) -> str:
-    return resources.files(__package__ or "rapid.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _hash(script: str) -> str:
-    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-
-
-def _fill(template: str, **parts: Markup) -> str:
-    """Put the parts in their places, in one pass: a part that looks like a place stays what it is."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: str(parts[match[1]]), template)

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rapid.pages.markup import Markup, tag
 from rapid.report.data import RoutingSnapshot
-from rapid.report.markup import Markup, tag
 from rapid.report.sections import missing, section
 
 

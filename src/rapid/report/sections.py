@@ -5,9 +5,9 @@ from typing import Any
 
 from rapid.evaluation.statistics import ENOUGH_SEEDS
 from rapid.evaluation.summary import NOT_APPLICABLE, NOT_APPLICABLE_WHY, NOT_RUN, SummaryRow, number
+from rapid.pages.markup import Markup, facts, join, tag
 from rapid.progress import format_seconds
 from rapid.report.data import ReportData, paper_return
-from rapid.report.markup import Markup, facts, join, tag
 from rapid.report.tables import (
     action_legend,
     attack_sentences,

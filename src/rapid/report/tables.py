@@ -9,11 +9,11 @@ from rapid.errors import RapidError
 from rapid.evaluation.statistics import Estimate
 from rapid.evaluation.summary import KINDS, NOT_APPLICABLE, NOT_RUN, AttackCell, SummaryRow, number, units
 from rapid.experiments.paper import PaperResult
+from rapid.pages.episodes import ACTION_WORDS
+from rapid.pages.markup import Markup, tag, text
 from rapid.report.data import paper_return
-from rapid.report.markup import Markup, tag, text
-from rapid.scenarios import ACTIONS, Scenario, get_scenario
+from rapid.scenarios import Scenario, get_scenario
 
-ACTION_WORDS = tuple(name.replace("LANE_", "").lower() for name in ACTIONS)
 _MARKS: dict[str, str] = {"floor": "floor", "teacher": "teacher", "planner": "planner"}
 
 
