@@ -55,6 +55,9 @@ class TeacherConfig:
     """Control: tell the facts of one action about another (`local`, `digest`), to see whether the model uses them."""
     max_turns: Positive = 8
     """Tool calls allowed before a decision must be made (`react`)."""
+    max_fallback_share: Share = 0.2
+    """Share of decisions that a rule may make because the model gave no usable answer; above it, collecting stops. 1
+    never stops."""
     price_in: Amount = 0.0
     """Price of a million prompt tokens, in any currency; for the cost shown and budgeted."""
     price_out: Amount = 0.0
@@ -112,6 +115,8 @@ class MixConfig:
     """Number of transitions in the mixture."""
     level: Literal["transition", "batch"] = "transition"
     """`transition` draws the mixture once; `batch` keeps up to `size` of each source and mixes in every batch."""
+    drop_fallbacks: bool = False
+    """Leave out the transitions of which a rule chose the action because the model gave no usable answer."""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ from typing import Any
 
 from rapid.agents.open import open_agent
 from rapid.config import Config
+from rapid.data.dataset import Dataset
+from rapid.data.fallbacks import fallback_notice
 from rapid.data.journal import exclusive
 from rapid.data.shipped import SHIPPED
 from rapid.errors import RapidError, did_you_mean
@@ -132,7 +134,7 @@ def _check_whole(config: Config) -> None:
 def _collect(config: Config, home: RunDirectory) -> dict[str, Any]:
     if config.data:
         teacher_data, random_data = given_data(config)
-        return {"teacher_transitions": len(teacher_data), "random_transitions": len(random_data)}
+        return _collected(teacher_data, random_data)
     teacher_data = collect_transitions(config, home.path / "collect" / "teacher", "teacher")
     if len(teacher_data) < config.collect.teacher_transitions:
         raise RapidError(
@@ -142,7 +144,13 @@ def _collect(config: Config, home: RunDirectory) -> dict[str, Any]:
     # The random driver takes seconds: dividing its work would cost more than it gains.
     alone = replace(config, collect=replace(config.collect, engine="local", workers=1, shards=1))
     random_data = collect_transitions(alone, home.path / "collect" / "random", "random")
-    return {"teacher_transitions": len(teacher_data), "random_transitions": len(random_data)}
+    return _collected(teacher_data, random_data)
+
+
+def _collected(teacher: Dataset, random: Dataset) -> dict[str, Any]:
+    notice = fallback_notice(teacher)
+    sizes = {"teacher_transitions": len(teacher), "random_transitions": len(random)}
+    return {**sizes, **({"note": notice} if notice else {})}
 
 
 def _mix(config: Config, home: RunDirectory) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 from tyro.conf import Positional, arg
@@ -35,6 +35,9 @@ from rapid.errors import RapidError
 from rapid.presets import DEFAULT_PLAN, OF_RECIPE, differences, of_file, preset, without_presets
 from rapid.scenarios import PAPER_SCENARIOS, Reward, get_scenario
 from rapid.tracking import Tracking
+
+if TYPE_CHECKING:
+    from rapid.data.dataset import Dataset
 
 T = TypeVar("T")
 
@@ -389,7 +392,16 @@ def _collect(options: Collect, config: Config) -> int:
     print(f"{len(dataset)} transitions in {options.out}")
     if not (dataset.collection or {}).get("complete", True):
         print("The budget is spent; the same command with a larger one goes on.", file=sys.stderr)
+    _tell_fallbacks(dataset)
     return 0
+
+
+def _tell_fallbacks(dataset: "Dataset") -> None:
+    """Say how many decisions are not the model's, if there are any."""
+    from rapid.data.fallbacks import fallback_notice
+
+    if notice := fallback_notice(dataset):
+        print(notice, file=sys.stderr)
 
 
 def _relabel(options: Relabel, config: Config) -> int:
@@ -415,6 +427,7 @@ def _mix(options: Mix, config: Config) -> int:
     out = _new_folder(options.out)
     mixed = mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
     print(f"{len(mixed)} transitions in {options.out}")
+    _tell_fallbacks(mixed)
     return 0
 
 
@@ -438,11 +451,11 @@ def _distill(options: Distill, config: Config) -> int:
 
     check(config)
     if options.seeds == 1:
-        distill_agent(config, Path(options.dataset), Path(options.out))
+        distill_agent(config, Path(options.dataset), Path(options.out), tell=_tell_fallbacks)
         print(f"The agent is in {options.out}/agent")
         return 0
     seeds = range(config.seed, config.seed + options.seeds)
-    for home in distill_seeds(config, Path(options.dataset), Path(options.out), seeds):
+    for home in distill_seeds(config, Path(options.dataset), Path(options.out), seeds, tell=_tell_fallbacks):
         print(f"An agent is in {home}/agent")
     return 0
 

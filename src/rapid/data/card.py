@@ -4,6 +4,7 @@ import json
 from typing import Any
 
 from rapid.data.dataset import LICENCE, Dataset, summary
+from rapid.data.fallbacks import fallback_notice
 from rapid.data.transitions import SOURCES
 from rapid.scenarios import get_scenario
 
@@ -47,6 +48,8 @@ def card(dataset: Dataset) -> str:
             "",
             f"Mixed with p = {how['p']:g} teacher transitions at the level of the {how['level']}, seed {how['seed']}.",
         ]
+    if notice := fallback_notice(dataset):
+        lines += ["", notice]
     if "decisions" in facts:
         lines += ["", "## Decisions", "", *_decision_lines(facts["decisions"], len(dataset))]
     if "memory" in facts:

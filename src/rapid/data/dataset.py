@@ -54,6 +54,21 @@ class Dataset:
         return max((driver.get("memory", {}).get("experiences", 0) for driver in self.drivers.values()), default=0)
 
     @property
+    def fallback_N(self) -> np.ndarray:
+        """Of which transitions a rule chose the action, as the model gave no usable answer; of none without a log."""
+        if self.log is None:
+            return np.zeros(len(self), np.bool_)
+        return np.array(self.log.column("status").to_pylist(), object) == "fallback"
+
+    @property
+    def fallbacks(self) -> tuple[int, int]:
+        """How many of how many of the teacher's decisions a rule made, as far as the dataset knows."""
+        if self.mixture is not None:
+            told = self.mixture.get("fallbacks") or {"count": 0, "of": 0}
+            return told["count"], told["of"]
+        return int(self.fallback_N.sum()), len(self)
+
+    @property
     def teacher_share(self) -> float | None:
         """Share of teacher transitions that every batch must have; None where batches are drawn uniformly."""
         return float(self.mixture["p"]) if self.mixture and self.mixture["level"] == "batch" else None
@@ -209,13 +224,20 @@ def _round(value: float) -> float:
 
 
 def mix(
-    teacher: Dataset | None, random: Dataset | None, p: float, size: int, seed: int, level: MixLevel = "transition"
+    teacher: Dataset | None,
+    random: Dataset | None,
+    p: float,
+    size: int,
+    seed: int,
+    level: MixLevel = "transition",
+    drop_fallbacks: bool = False,
 ) -> Dataset:
     """Return the offline dataset D*: a share `p` of teacher transitions, the rest random ones (paper: section 4.2).
 
     Level `transition` draws p·size and (1-p)·size transitions without replacement. Level `batch` keeps up to `size`
     transitions of each source and lets the sampler draw the share `p` anew in every batch. The result depends on
-    the inputs and `seed` alone; `source_N` says where each transition came from.
+    the inputs and `seed` alone; `source_N` says where each transition came from. `drop_fallbacks` draws none of those
+    of which a rule chose the action in the model's place.
 
     Raises:
         RapidError: different scenarios, too few transitions, p outside [0, 1], a source that is no such source.
@@ -226,9 +248,12 @@ def mix(
         )
     wanted = {TEACHER: int(np.floor(p * size + 0.5)), RANDOM: size - int(np.floor(p * size + 0.5))}
     given = {source: dataset for source, dataset in ((TEACHER, teacher), (RANDOM, random)) if dataset is not None}
+    places = {source: np.arange(len(dataset)) for source, dataset in given.items()}
+    if drop_fallbacks:
+        places = {source: np.flatnonzero(~dataset.fallback_N) for source, dataset in given.items()}
     if level == "batch":
         # The share is drawn in every batch, so each source brings what it has.
-        wanted = {source: min(size, len(given.get(source, ()))) if wanted[source] else 0 for source in wanted}
+        wanted = {source: min(size, len(places.get(source, ()))) if wanted[source] else 0 for source in wanted}
     names = sorted({dataset.scenario for dataset in given.values()})
     if len(names) > 1:
         raise RapidError(
@@ -238,10 +263,11 @@ def mix(
     parts: list[Transitions] = []
     drivers: dict[str, dict[str, Any]] = {}
     sources: dict[str, Any] = {}
+    fallbacks: dict[str, Any] = {}
     for source, count in wanted.items():
         if not count and not (level == "batch" and (p if source == TEACHER else 1 - p) > 0):
             continue
-        have = len(given[source]) if source in given else 0
+        have = len(places.get(source, ()))
         if not have or count > have:
             raise RapidError(
                 f"The mixture needs {count} {SOURCES[source]} transitions (p={p:g}, size={size}), but there are "
@@ -254,10 +280,17 @@ def mix(
                 "Give a collected dataset, not a mixture."
             )
         # Sorted, so that neighbours that both were drawn stay neighbours: n-step returns can use them.
-        parts.append(rows.select(np.sort(rng.choice(have, count, replace=False))))
+        drawn = places[source][np.sort(rng.choice(have, count, replace=False))]
+        parts.append(rows.select(drawn))
+        if source == TEACHER:
+            rule = given[source].fallback_N
+            left_out = len(rows) - len(places[source])
+            fallbacks = {"count": int(rule[drawn].sum()), "of": count, "left_out": left_out} if rule.any() else {}
         sources[SOURCES[source]] = summary(given[source])[SOURCES[source]]
         drivers |= {name: facts for name, facts in given[source].drivers.items() if name == SOURCES[source]}
     mixture = {"p": p, "size": size, "level": level, "seed": seed, "sources": sources}
+    if fallbacks:
+        mixture["fallbacks"] = fallbacks
     return Dataset(names[0], concatenate(parts), drivers, mixture=mixture)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from rapid.data.dataset import Dataset
+from rapid.data.fallbacks import TooManyFallbacksError, check_share, is_fallback
 from rapid.data.hindsight import Hindsight
 from rapid.data.journal import Journal
 from rapid.data.tables import (
@@ -28,7 +29,7 @@ from rapid.errors import RapidError
 from rapid.progress import Task
 from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
 from rapid.seeding import stream_seed
-from rapid.teacher.decision import Decision, Teacher
+from rapid.teacher.decision import Decision, Teacher, UnreachableError
 from rapid.teacher.experience import MEMORY_FILE, Experience
 
 MakeWorlds = Callable[[int], Any]
@@ -47,6 +48,8 @@ class Budget:
     """Wall-clock seconds of this process."""
     decisions: int = 0
     """Decisions; never exceeded, while the others are noticed once they are."""
+    fallback_share: float = 1.0
+    """Share of decisions that a rule may make in the model's place; above it, collecting fails."""
 
 
 class Tally(NamedTuple):
@@ -95,6 +98,7 @@ class Collecting:
         self.tokens = int(sum(self._sum(name) for name in ("tokens_in", "tokens_out")))
         self.cost = self._sum("cost")
         self.fallbacks = sum(part.column("status").to_pylist().count("fallback") for part in self.parts)
+        self.last_fallback: Decision | None = None
         self.hindsight, self.looked_back = Hindsight(work / MEMORY_FILE, teacher), 0
         for experience in self.hindsight.experiences:
             self._charge(experience)
@@ -162,10 +166,20 @@ class Collecting:
             if decisions is None:
                 self._check_budget(len(active))
                 keys = np.array([stream_seed(seeds[world], f"step/{step}") for world in active], np.int64)
-                decisions = self.teacher.decide(seen, [previous[world] for world in active], keys)
+                try:
+                    decisions = self.teacher.decide(seen, [previous[world] for world in active], keys)
+                except UnreachableError:
+                    # What the rule decided just before, while the server was already gone, is asked again.
+                    journal.forget_end(lambda decision: decision.unanswered)
+                    raise
                 journal.append(seen, decisions)
                 self.fresh += len(decisions)
             self._count(decisions)
+            try:
+                check_share(self.fallbacks, self.decisions, self.budget.fallback_share, self.last_fallback)
+            except TooManyFallbacksError:
+                journal.forget_from(is_fallback)
+                raise
             # The actions of finished worlds are ignored.
             actions = np.full(len(seeds), IDLE, np.int64)
             actions[active] = [decision.action for decision in decisions]
@@ -247,7 +261,8 @@ class Collecting:
         self.decisions += len(decisions)
         self.tokens += sum(decision.tokens_in + decision.tokens_out for decision in decisions)
         self.cost += sum(decision.cost for decision in decisions)
-        self.fallbacks += sum(decision.status == "fallback" for decision in decisions)
+        for decision in filter(is_fallback, decisions):
+            self.fallbacks, self.last_fallback = self.fallbacks + 1, decision
 
     def _check_budget(self, coming: int) -> None:
         """Raise if the budget is spent, or does not allow for the decisions that come next."""

@@ -3,7 +3,7 @@
 import json
 import os
 import zlib
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -91,6 +91,30 @@ class Journal:
         # What the system holds outlives the process; only a power cut could take it. Sync what took long to get.
         if sum(decision.seconds for decision in decisions) > _SYNC_AFTER_SECONDS:
             os.fsync(self._stream.fileno())
+
+    def forget_from(self, unwanted: Callable[[Decision], bool]) -> None:
+        """Remove the first step with an unwanted decision and all steps after it: they are decided anew."""
+        steps = [any(map(unwanted, self._decisions(line))) for line in self._lines[1:]]
+        if True in steps:
+            self._keep(1 + steps.index(True))
+
+    def forget_end(self, unwanted: Callable[[Decision], bool]) -> None:
+        """Remove the steps at the end of which the last decision is unwanted."""
+        count = len(self._lines)
+        while count > 1 and any(map(unwanted, self._decisions(self._lines[count - 1])[-1:])):
+            count -= 1
+        self._keep(count)
+
+    def _keep(self, count: int) -> None:
+        """Remove all lines but the first `count`."""
+        lines = self.path.read_bytes().splitlines(keepends=True)
+        os.truncate(self.path, sum(map(len, lines[:count])))
+        del self._lines[count:]
+        self._next = min(self._next, count)
+
+    @staticmethod
+    def _decisions(line: dict[str, Any]) -> list[Decision]:
+        return [from_record(decision) for decision in line["decisions"] if decision is not None]
 
     def close(self) -> None:
         """Close the file and keep it."""

@@ -250,7 +250,7 @@ def _place(work: Path, part: int, shards: int) -> Path:
 def _share(budget: Budget, shards: int) -> Budget:
     """Return one shard's part of a budget; what is limited stays limited."""
     decisions, tokens = (max(1, limit // shards) if limit else 0 for limit in (budget.decisions, budget.tokens))
-    return Budget(tokens, budget.cost / shards, decisions=decisions)
+    return replace(budget, tokens=tokens, cost=budget.cost / shards, seconds=0.0, decisions=decisions)
 
 
 def _is_done(job: _Job) -> bool:

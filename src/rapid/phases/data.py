@@ -27,7 +27,9 @@ def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher"
     settings = config.teacher if source == "teacher" else TeacherConfig(backend="scripted", model="random")
     sizes = config.collect
     wanted = sizes.teacher_transitions if source == "teacher" else sizes.random_transitions
-    budget = Budget(sizes.max_tokens, sizes.max_cost, sizes.max_seconds, sizes.max_decisions)
+    budget = Budget(
+        *(sizes.max_tokens, sizes.max_cost, sizes.max_seconds, sizes.max_decisions), settings.max_fallback_share
+    )
     options: dict[str, Any] = {
         "source": source,
         "budget": budget if source == "teacher" else None,
@@ -101,14 +103,20 @@ def given_data(config: Config) -> tuple[Dataset, Dataset]:
                 f"The {name} dataset in '{config.data}' is of the scenario '{dataset.scenario}', not '{scenario}'. "
                 f"Choose --scenario {dataset.scenario}, or other data."
             )
-    mix(teacher, random, config.mix.p, config.mix.size, config.seed, config.mix.level)
+    mix_as_set(config, teacher, random, config.seed)
     return teacher, random
+
+
+def mix_as_set(config: Config, teacher: Dataset, random: Dataset, seed: int) -> Dataset:
+    """Mix two datasets as the settings say."""
+    how = config.mix
+    return mix(teacher, random, how.p, how.size, seed, how.level, how.drop_fallbacks)
 
 
 def mix_datasets(config: Config, teacher_data: Path, random_data: Path, out: Path) -> Dataset:
     """Mix two datasets at ratio p into `out`."""
     teacher, random = load_dataset(teacher_data), load_dataset(random_data)
-    mixed = mix(teacher, random, config.mix.p, config.mix.size, stream_seed(config.seed, "mix"), config.mix.level)
+    mixed = mix_as_set(config, teacher, random, stream_seed(config.seed, "mix"))
     save_dataset(mixed, out)
     return mixed
 

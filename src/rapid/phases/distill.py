@@ -1,6 +1,6 @@
 """Phase 2 on disk: train policies offline on a dataset, RAPID and its baselines."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,16 +21,27 @@ from rapid.training.machinery.record import CHECKPOINT_FILE
 from rapid.training.offline import distill, is_stackable
 
 
-def distill_agent(config: Config, data: Path, out: Path, name: str = "distilled") -> QAgent:
-    """Train a policy offline on the dataset in `data`; the agent is written to ``out/agent``."""
+def distill_agent(
+    config: Config, data: Path, out: Path, name: str = "distilled", tell: Callable[[Dataset], None] | None = None
+) -> QAgent:
+    """Train a policy offline on the dataset in `data`, which `tell` is shown before; see ``out/agent``."""
     dataset = load_dataset(data)
+    if tell:
+        tell(dataset)
     network = _new_network(config, dataset)
     _distill_network(config, dataset, network, out, name, stream_seed(config.seed, "distill"))
     _save_distilled(config, data, dataset, network, out, name)
     return QAgent(network, name)
 
 
-def distill_seeds(config: Config, data: Path, out: Path, seeds: Sequence[int], name: str = "distilled") -> list[Path]:
+def distill_seeds(
+    config: Config,
+    data: Path,
+    out: Path,
+    seeds: Sequence[int],
+    name: str = "distilled",
+    tell: Callable[[Dataset], None] | None = None,
+) -> list[Path]:
     """Train a policy of each seed on the dataset in `data`, and return their directories, ``out/seed-N``.
 
     Where the networks can be stacked (:mod:`rapid.networks.stack`) they train together, recorded in ``out/together``;
@@ -50,9 +61,11 @@ def distill_seeds(config: Config, data: Path, out: Path, seeds: Sequence[int], n
         if together.exists():
             raise RapidError(f"'{together}' holds seeds that were trained together. Choose another --out.")
         for each, home in zip(own, homes, strict=True):
-            distill_agent(each, data, home, name)
+            distill_agent(each, data, home, name, tell if home == homes[0] else None)
         return homes
     dataset = load_dataset(data)
+    if tell:
+        tell(dataset)
     stack = stack_networks([_new_network(each, dataset) for each in own])
     streams = [stream_seed(seed, "distill") for seed in seeds]
     _distill_network(config, dataset, stack, together, f"{name} {len(homes)} seeds", streams)

@@ -7,6 +7,7 @@ from rapid.agents.saved import load_agent
 from rapid.config import Config
 from rapid.config_io import apply_overrides, to_dict
 from rapid.data.dataset import load_dataset, summary
+from rapid.data.fallbacks import fallback_notice
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.recording import Recording, load_recordings
 from rapid.files import read_json
@@ -43,6 +44,8 @@ def write_run_report(config: Config, directory: Path) -> Path:
     notes = []
     if config.data:
         notes.append(f"Nothing was collected in this run; its data: {config.data}.")
+    if notice := fallback_notice(teacher_data):
+        notes.append(notice + (" This run left them out of its mixture." if config.mix.drop_fallbacks else ""))
     measured = read_json(steps["evaluate"]) if steps["evaluate"].exists() else {}
     if "note" in measured:
         notes.append(measured["note"])
