@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rapid.attacks.draws import Source
-from rapid.attacks.search import Ball, Values
+from rapid.attacks.search import AtState, Ball, Values
 from rapid.attacks.spec import AttackSpec
 from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
@@ -58,9 +58,24 @@ class Attack(Protocol):
         ...
 
 
-Shown = Callable[[Tensor, NDArray[np.int64], Any], Tensor]
-"""What some worlds show instead of their true observations (B, V, F); the other arguments are which worlds they are and
-the environment that holds them all."""
+@dataclass(frozen=True)
+class Moment:
+    """One step of the worlds still under way."""
+
+    obs_BVF: Tensor
+    """Their true observations, metres and m/s."""
+    worlds: NDArray[np.int64]
+    """Which worlds they are."""
+    values: Values | None
+    """The agent's Q-values (B, A) of raw observations, if it has any: what it remembers is in them."""
+    state_BS: NDArray[np.float32] | None = None
+    """What it remembers, if it has a memory."""
+    env: Any = None
+    """The environment that holds all worlds."""
+
+
+Shown = Callable[[Moment], Tensor]
+"""What the agent is shown at a moment (B, V, F)."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +84,15 @@ class Field:
 
     agent: Any
     """Who drives."""
-    values: Values | None
-    """The agent's Q-values (B, A) of raw observations, if it has any."""
     streams: Sequence[torch.Generator]
     """One for each episode."""
     scenario: str = ""
     seeds: Sequence[int] = ()
     """The spawn seed of each."""
+
+    def sources(self, worlds: NDArray[np.int64]) -> list[torch.Generator]:
+        """Return the streams of some of them."""
+        return [self.streams[world] for world in worlds.tolist()]
 
 
 def network_of(agent: Any) -> torch.nn.Module | None:
@@ -84,12 +101,26 @@ def network_of(agent: Any) -> torch.nn.Module | None:
     return network if isinstance(network, torch.nn.Module) else None
 
 
-def values_of(agent: Any) -> Values | None:
-    """Return the agent's Q-values as a function of raw observations: its network, or what it says without one."""
-    q_values = getattr(agent, "q_values", None)
-    if (network := network_of(agent)) is not None or not callable(q_values):
-        return network
-    return lambda obs_BVF: torch.from_numpy(np.array(q_values(obs_BVF.numpy()), np.float32))
+def values_of(agent: Any, state_BS: NDArray[np.float32] | None = None) -> Values | None:
+    """Return the agent's Q-values as a function of raw observations: its network, or what it says without one.
+
+    Args:
+        agent: who drives.
+        state_BS: what it remembers beside each observation, if it has a memory.
+    """
+    network, q_values = network_of(agent), getattr(agent, "q_values", None)
+    if network is not None:
+        device = next(network.parameters()).device
+        return network if state_BS is None else AtState(network, torch.from_numpy(state_BS).to(device))
+    if not callable(q_values):
+        return None
+    if state_BS is None:
+        return lambda obs_BVF: torch.from_numpy(np.array(q_values(obs_BVF.numpy()), np.float32))
+
+    def remembering(obs_BVF: Tensor, state_BS: Tensor) -> Tensor:
+        return torch.from_numpy(np.array(q_values(obs_BVF.numpy(), state_BS.numpy()), np.float32))
+
+    return AtState(remembering, torch.from_numpy(state_BS))
 
 
 def offers(agent: Any) -> tuple[Needs, ...]:
@@ -128,7 +159,7 @@ class Base(ABC):
 
     def begin(self, field: Field) -> Shown:
         """Return what is shown in these episodes; whatever an attack remembers, it remembers there."""
-        return lambda obs_RVF, worlds, env: self(field.values, obs_RVF, [field.streams[world] for world in worlds])
+        return lambda now: self(now.values, now.obs_BVF, field.sources(now.worlds))
 
     def ball(self, network: Any, obs_BVF: Tensor) -> Ball:
         """Return what may be shown, for observations of this shape.

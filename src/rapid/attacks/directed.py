@@ -4,14 +4,15 @@ An untargeted attack leads to whichever action lies nearest, and that is often S
 cars to speed up, or to change lanes, harms much more.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from rapid.attacks.draws import Source, chosen
-from rapid.attacks.search import Aim, Ball, Runs, Values, ascend, own_action
+from rapid.attacks.search import Aim, Ball, Runs, Values, ascend, own_action, values_at
 from rapid.attacks.spec import Target
+from rapid.attacks.square import squares
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, SLOWER
 
 ORDERS: dict[Target, tuple[int, ...]] = {
@@ -45,8 +46,9 @@ def direct(values: Values, obs_BVF: Tensor, order: Sequence[int], ball: Ball, ru
         if not len(rows_R):
             break
         aim = Aim("toward", torch.full_like(rows_R, action), own.true_q_BA[rows_R])
-        found_RVF = ascend(values, obs_BVF[rows_R], aim, ball, runs, chosen(source, rows_R.tolist()))
-        reached_R = _taken(values, found_RVF) == action
+        some = values_at(values, rows_R)
+        found_RVF = ascend(some, obs_BVF[rows_R], aim, ball, runs, chosen(source, rows_R.tolist()))
+        reached_R = _taken(some, found_RVF) == action
         seen_BVF[rows_R[reached_R]] = found_RVF[reached_R]
         open_B[rows_R[reached_R]] = False
     return seen_BVF
@@ -57,14 +59,36 @@ def reachable(values: Values, obs_BVF: Tensor, ball: Ball, runs: Runs, source: S
 
     What is not found may be in reach all the same: this is a lower bound of what an attacker can do.
     """
+
+    def search(some: Values, true_RVF: Tensor, aim: Aim, source: Source) -> Tensor:
+        return ascend(some, true_RVF, aim, ball, runs, source)
+
+    return _reach(values, obs_BVF, search, source)
+
+
+def reachable_without_gradients(
+    values: Values, obs_BVF: Tensor, ball: Ball, queries: int, source: Source
+) -> tuple[Tensor, Tensor]:
+    """Return what :func:`reachable` does, by random search with so many points for each action."""
+
+    def search(some: Values, true_RVF: Tensor, aim: Aim, source: Source) -> Tensor:
+        return squares(some, true_RVF, aim, ball, queries, source)
+
+    return _reach(values, obs_BVF, search, source)
+
+
+def _reach(
+    values: Values, obs_BVF: Tensor, search: Callable[[Values, Tensor, Aim, Source], Tensor], source: Source
+) -> tuple[Tensor, Tensor]:
     own = own_action(values, obs_BVF, "toward")
     within_BA = torch.nn.functional.one_hot(own.action_B, NUM_ACTIONS).bool()
     points_BAVF = obs_BVF[:, None].repeat(1, NUM_ACTIONS, 1, 1)
     others_R2 = (~within_BA).nonzero()
     rows_R, action_R = others_R2[:, 0], others_R2[:, 1]
     aim = Aim("toward", action_R, own.true_q_BA[rows_R])
-    found_RVF = ascend(values, obs_BVF[rows_R], aim, ball, runs, chosen(source, rows_R.tolist()))
-    within_BA[rows_R, action_R] = _taken(values, found_RVF) == action_R
+    some = values_at(values, rows_R)
+    found_RVF = search(some, obs_BVF[rows_R], aim, chosen(source, rows_R.tolist()))
+    within_BA[rows_R, action_R] = _taken(some, found_RVF) == action_R
     points_BAVF[rows_R, action_R] = found_RVF
     return within_BA, points_BAVF
 

@@ -3,12 +3,10 @@
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from rapid.attacks.attack import Base, Field, Needs, Shown
+from rapid.attacks.attack import Base, Field, Moment, Needs, Shown
 from rapid.attacks.directed import ORDERS, direct
 from rapid.attacks.draws import Source, uniform
 from rapid.attacks.noise import add_noise, lies
@@ -102,11 +100,13 @@ class LieAttack(Base):
         """Return what is shown in these episodes; what is drawn is drawn at the first step."""
         drawn: dict[int, Tensor] = {}
 
-        def shown(obs_RVF: Tensor, worlds: NDArray[np.int64], env: Any) -> Tensor:
-            for world in worlds.tolist():
+        def shown(now: Moment) -> Tensor:
+            worlds = now.worlds.tolist()
+            for world in worlds:
                 if world not in drawn:
-                    drawn[world] = uniform((1, *obs_RVF.shape[1:]), [field.streams[world]], obs_RVF.device)
-            return self._at(field.values, obs_RVF, torch.cat([drawn[world] for world in worlds.tolist()]))
+                    shape, device = (1, *now.obs_BVF.shape[1:]), now.obs_BVF.device
+                    drawn[world] = uniform(shape, [field.streams[world]], device)
+            return self._at(now.values, now.obs_BVF, torch.cat([drawn[world] for world in worlds]))
 
         return shown
 
@@ -129,13 +129,12 @@ class CoupledAttack(Base):
         """Return what is shown in these episodes: before the first step nothing is perturbed."""
         before: dict[int, Tensor] = {}
 
-        def shown(obs_RVF: Tensor, worlds: NDArray[np.int64], env: Any) -> Tensor:
-            none_VF = torch.zeros_like(obs_RVF[0])
-            before_RVF = torch.stack([before.get(world, none_VF) for world in worlds.tolist()])
-            sources = [field.streams[world] for world in worlds]
-            seen_RVF, offset_RVF = self._step(field.values, obs_RVF, sources, before_RVF)
-            before.update(zip(worlds.tolist(), offset_RVF, strict=True))
-            return seen_RVF
+        def shown(now: Moment) -> Tensor:
+            worlds, none_VF = now.worlds.tolist(), torch.zeros_like(now.obs_BVF[0])
+            before_BVF = torch.stack([before.get(world, none_VF) for world in worlds])
+            seen_BVF, offset_BVF = self._step(now.values, now.obs_BVF, field.sources(now.worlds), before_BVF)
+            before.update(zip(worlds, offset_BVF, strict=True))
+            return seen_BVF
 
         return shown
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from rapid.attacks import kinds
 from rapid.attacks.attack import Attack
 from rapid.attacks.spec import AttackSpec, Kind, as_spec
+from rapid.attacks.world import WorldAttack
 
 _MAKERS: dict[Kind, Callable[[AttackSpec, int | None], Attack]] = {
     "none": kinds.NoAttack,
@@ -17,6 +18,7 @@ _MAKERS: dict[Kind, Callable[[AttackSpec, int | None], Attack]] = {
     "transfer": kinds.TransferAttack,
     "lie": kinds.LieAttack,
     "coupled": kinds.CoupledAttack,
+    "world": WorldAttack,
 }
 
 

@@ -19,6 +19,33 @@ from rapid.attacks.draws import Source, chosen, normal, uniform
 Values = Callable[[Tensor], Tensor]
 """Raw observations (B, V, F) to Q-values (B, A)."""
 
+
+@dataclass(frozen=True)
+class AtState:
+    """A network with a memory, in one state for each observation, as :data:`Values`."""
+
+    network: Any
+    state_BS: Tensor
+
+    @property
+    def lanes(self) -> int:
+        """Of the road that the network knows."""
+        return self.network.lanes
+
+    def __call__(self, obs_BVF: Tensor) -> Tensor:
+        """Return the Q-values (B, A)."""
+        return self.network(obs_BVF, self.state_BS)
+
+    def take(self, rows_R: Tensor) -> "AtState":
+        """Return it for some of the observations."""
+        return AtState(self.network, self.state_BS[rows_R])
+
+
+def values_at(values: Values, rows_R: Tensor) -> Values:
+    """Return the values of some of the observations: those of who remembers belong to theirs."""
+    return values.take(rows_R) if isinstance(values, AtState) else values
+
+
 ROUNDING = 1e-5
 """Share of the radius left free, so that float32 metres, read back, still lie inside the ball."""
 TEMPERATURE = 0.1
@@ -149,7 +176,7 @@ def step_length(radius: float, step: int) -> float:
 @contextmanager
 def for_gradients(values: Values) -> Generator[None]:
     """Allow gradients by the observations, and spare those by the weights."""
-    module: Any = values
+    module: Any = values.network if isinstance(values, AtState) else values
     weights = [p for p in module.parameters() if p.requires_grad] if isinstance(module, nn.Module) else []
     with torch.inference_mode(False), torch.enable_grad():
         for weight in weights:
@@ -197,7 +224,7 @@ def ascend(values: Values, obs_BVF: Tensor, aim: Aim, ball: Ball, runs: Runs, so
             else:
                 offset_RVF = nearby.project(torch.zeros_like(true_RVF))
             trace = _Trace(shown_BVF, best_B, reached_B, rows_R, runs.keep)
-            first_RVF = _climb(values, true_RVF, offset_RVF, some, nearby, runs, trace)
+            first_RVF = _climb(values_at(values, rows_R), true_RVF, offset_RVF, some, nearby, runs, trace)
             if run == 0 and runs.start == "clean":
                 fgsm_BVF = first_RVF
             rows_R = (~reached_B).nonzero().squeeze(1)
@@ -251,7 +278,7 @@ def _climb(
             if runs.stop and bool((done_R := trace.reached_B[trace.rows_R]).any()):
                 left_R = ~done_R
                 true_RVF, offset_RVF, aim = true_RVF[left_R], offset_RVF[left_R], aim.take(left_R)
-                ball = ball.take(left_R)
+                ball, values = ball.take(left_R), values_at(values, left_R.nonzero().squeeze(1))
                 trace.rows_R = trace.rows_R[left_R]
                 if not len(true_RVF):
                     break

@@ -13,7 +13,9 @@ from urllib.parse import quote, unquote
 
 from rapid.errors import RapidError, did_you_mean
 
-Kind = Literal["none", "uniform", "gaussian", "fgsm", "pgd", "directed", "square", "transfer", "lie", "coupled"]
+Kind = Literal[
+    "none", "uniform", "gaussian", "fgsm", "pgd", "directed", "square", "transfer", "lie", "coupled", "world"
+]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Norm = Literal["linf", "l2"]
 Loss = Literal["ce", "margin", "dlr", "min-q", "mad"]
@@ -73,6 +75,10 @@ class AttackSpec:
     up or down as is drawn once an episode."""
     coupling: float = 0.2
     """`coupled`: by what share of the ball's size the perturbation of a feature may change from step to step."""
+    horizon: int = 10
+    """`world`: decisions for which the true world is driven on by the agent, to see what an action leads to."""
+    budget: int = 0
+    """`world`: decisions of an episode that may be attacked, there where it costs most; 0: all."""
     source: str = ""
     """`transfer`: the agent that is attacked instead of the one that drives."""
     label: str = field(default="", compare=False)
@@ -136,6 +142,8 @@ class AttackSpec:
             "square": f"{ball}, without gradients, {self.queries} points{loss}",
             "transfer": f"{ball}, made on {self.source}, {runs}{loss}",
             "lie": f"the same lie in every step: {self.to}, within {units}",
+            "world": f"{ball}, the action in reach that is worst in the true world within {self.horizon} decisions, "
+            f"{f'{self.budget} attacked decisions an episode' if self.budget else 'every decision'}, {runs}",
             "coupled": f"{ball}, changing by {self.coupling:.0%} of it a step at most, {runs}{loss}",
         }[self.kind]
 
@@ -152,6 +160,7 @@ _FIELDS: dict[Kind, tuple[str, ...]] = {
     "square": ("loss", "queries", *_SIZE),
     "transfer": ("source", *_RUNS, "loss"),
     "lie": ("to", *_SIZE),
+    "world": ("horizon", "budget", *_RUNS),
     "coupled": ("coupling", "steps", "step", "restarts", *_SIZE, "loss"),
 }
 
@@ -160,6 +169,7 @@ _OWN_DEFAULTS: dict[Kind, dict[str, Any]] = {
     "gaussian": {"radius": 0.2},
     "directed": {"steps": 20, "restarts": 2},
     "square": {"loss": "margin"},
+    "world": {"steps": 20, "restarts": 1},
 }
 
 
@@ -268,6 +278,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "restarts": (1, 1000),
     "queries": (1, 100_000),
     "coupling": (0, 2),
+    "horizon": (1, 60),
+    "budget": (0, 1000),
 }
 
 

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from rapid.agents.open import Driver
-from rapid.attacks.attack import Attack, Field, Shown, network_of, values_of
+from rapid.attacks.attack import Attack, Field, Moment, Shown, network_of, values_of
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import time_to_collision
 from rapid.evaluation.recording import Recording
@@ -28,16 +28,26 @@ class Perturbation:
         if attack is None:
             return
         network = network_of(agent)
+        self._agent = agent
         self._device = torch.device("cpu") if network is None else next(network.parameters()).device
         streams = [torch_stream(generator_seed, f"attack/{seed}") for seed in seeds]
-        self._shown = attack.begin(Field(agent, values_of(agent), streams, scenario, seeds.tolist()))
+        self._shown = attack.begin(Field(agent, streams, scenario, seeds.tolist()))
 
-    def __call__(self, obs_BVF: NDArray[np.float32], worlds: NDArray[np.int64], env: Any) -> NDArray[np.float32]:
-        """Return what is shown of the true observations of `worlds`; `env` holds all of them."""
+    def __call__(
+        self,
+        obs_BVF: NDArray[np.float32],
+        worlds: NDArray[np.int64],
+        env: Any,
+        state_BS: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """Return what is shown of the true observations of `worlds`.
+
+        `env` holds all worlds; `state_BS` is what an agent with a memory remembers in these, which the attack knows.
+        """
         if self._shown is None:
             return obs_BVF
         obs = torch.from_numpy(np.ascontiguousarray(obs_BVF)).to(self._device)
-        seen = self._shown(obs, worlds, env)
+        seen = self._shown(Moment(obs, worlds, values_of(self._agent, state_BS), state_BS, env))
         return seen.detach().cpu().numpy().astype(np.float32, copy=False)
 
 
