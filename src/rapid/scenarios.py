@@ -91,6 +91,53 @@ class Scenario:
         return config
 
 
+HIGHWAY_ENV_IDS: dict[str, tuple[int, float, Dynamics]] = {
+    "highway-v0": (4, 1.0, "v0"),
+    "highway-fast-v0": (3, 1.0, "fast"),
+}
+"""Lanes, density and dynamics of the environments that highway-env registers."""
+
+
+@dataclass(frozen=True)
+class HighwayEnvTask(Scenario):
+    """HighwayEnv's own task, known by its id: its defaults and nothing on top.
+
+    Its observation is HighwayEnv's (five vehicles, relative and normalised), which no agent, teacher or attack of RAPID
+    reads; so it is a task for :func:`rapid.make_env` and its like, and no scenario of a run.
+    """
+
+    @property
+    def name(self) -> str:
+        """HighwayEnv's id."""
+        return self.env_id
+
+    def config(self) -> dict[str, Any]:
+        """Return the keys that :data:`rapid.simulator.settings.DEFAULTS` leaves out, with HighwayEnv's values."""
+        return {
+            "screen_width": 600,
+            "screen_height": 150,
+            "centering_position": [0.3, 0.5],
+            "scaling": 5.5,
+            "show_trajectories": False,
+            "render_agent": True,
+            "offscreen_rendering": None,
+            "real_time_rendering": False,
+            "neighbour_vehicles_connected_lanes": False,
+            "lane_change_reward": 0,
+        }
+
+
+def get_task(name: str) -> Scenario:
+    """Return the scenario called `name`, or HighwayEnv's own task if that is one of its ids.
+
+    Raises:
+        RapidError: it is neither.
+    """
+    if name in HIGHWAY_ENV_IDS:
+        return HighwayEnvTask(*HIGHWAY_ENV_IDS[name])
+    return get_scenario(name)
+
+
 def seeing(vehicles: int) -> dict[str, Any]:
     """Return what to override of a scenario's configuration so that an observation has so many rows."""
     return {"observation": {"vehicles_count": vehicles}}
@@ -112,12 +159,19 @@ def get_scenario(name: str) -> Scenario:
     Raises:
         RapidError: the name does not follow the pattern, or asks for a road that cannot exist.
     """
+    if name in HIGHWAY_ENV_IDS:
+        lanes, density, dynamics = HIGHWAY_ENV_IDS[name]
+        raise RapidError(
+            f"'{name}' is HighwayEnv's task with HighwayEnv's observation, which RAPID's agents do not read: it is for "
+            f"rapid.make_env, make_vec and make_sb3_vec. The same road is '{Scenario(lanes, density, dynamics).name}'."
+        )
     match = _NAME.fullmatch(name.strip())
     if match is None:
         raise RapidError(
             f"Unknown scenario '{name}'{did_you_mean(name, SCENARIOS)} Expected lane-N-density-D with an optional "
             f"-fast, :progress and :clock, in this order. Listed scenarios: {', '.join(SCENARIOS[:9])}; each also with "
-            "any of the three."
+            "any of the three. Environments are also known by HighwayEnv's ids: "
+            f"{', '.join(HIGHWAY_ENV_IDS)}."
         )
     lanes, density = int(match[1]), float(match[2])
     if not 1 <= lanes <= 20:

@@ -264,7 +264,8 @@ class VerifySimulator:
     episodes: Positive = 12
     """Episodes in all, shared among the scenarios."""
     scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = ()
-    """Scenarios; by default the paper's with both dynamics, and others that reach the rest of the configuration."""
+    """Scenarios or HighwayEnv's ids; by default the paper's with both dynamics, HighwayEnv's own, and others that reach
+    the rest of the configuration; then the time limits at many frequencies are compared too."""
     processes: Positive = 1
     """Processes that drive highway-env, which takes nearly all of the time."""
     plain_math: bool = True
@@ -563,6 +564,7 @@ def _verify(options: VerifySimulator, config: Config) -> int:
             options.episodes,
             processes=options.processes,
             plain_math=options.plain_math,
+            time_limits=not options.scenarios,
             progress=lambda done, total, findings: work.advance(),
         )
     print(findings.verdict())

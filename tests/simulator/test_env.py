@@ -144,7 +144,7 @@ def test_other_mistakes_are_explained() -> None:
         with pytest.raises(RapidError, match="reset"):
             call()
     with pytest.raises(RapidError, match="options"):
-        env.reset(options={"config": {}})
+        env.reset(options={"configuration": {}})
     env.reset(seed=0)
     with pytest.raises(RapidError, match="vehicles"):
         CompiledHighwayEnv("lane-3-density-2").restore(env.snapshot())

@@ -7,7 +7,8 @@ import pytest
 
 from rapid.errors import RapidError
 from rapid.scenarios import SCENARIOS, Dynamics, get_scenario
-from rapid.simulator.settings import DEFAULTS, WITHOUT_EFFECT, merge_config, read_settings
+from rapid.simulator.configuration import merge_config
+from rapid.simulator.settings import DEFAULTS, WITHOUT_EFFECT, read_settings
 
 
 @pytest.mark.parametrize("dynamics", ["v0", "fast"])
@@ -41,7 +42,6 @@ def test_every_listed_scenario_is_covered(name: str) -> None:
         ({"duration": -1}, "duration"),
         ({"collision_reward": math.inf}, "collision_reward"),
         ({"initial_lane_id": 4}, "initial_lane_id"),
-        ({"simulation_frequency": 1, "policy_frequency": 2}, "simulation_frequency"),
         ({"reward_speed_range": [20, 20]}, "reward_speed_range"),
         ({"reward_speed_range": [20]}, "reward_speed_range"),
         ({"normalize_reward": 1}, "normalize_reward"),

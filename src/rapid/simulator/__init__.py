@@ -1,30 +1,61 @@
 """The compiled twin of HighwayEnv: same spawns, same decisions, same rewards, three orders of magnitude faster.
 
-Importing this package also registers ``rapid/Highway-v0`` with Gymnasium (``gymnasium.make("rapid.simulator:
-rapid/Highway-v0", scenario="lane-4-density-2.5")`` imports it by itself); nothing is compiled before the first step.
+Importing this package also registers its ids with Gymnasium (see :mod:`rapid.registration`); nothing is compiled before
+the first step.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import gymnasium
 
+from rapid import registration
 from rapid.errors import RapidError, did_you_mean
 from rapid.scenarios import Scenario
 
 if TYPE_CHECKING:
     from rapid.simulator.env import CompiledHighwayEnv as CompiledHighwayEnv
+    from rapid.simulator.reference import ReferenceHighwayEnv, ReferenceVectorEnv
+    from rapid.simulator.sb3 import Sb3Worlds as Sb3Worlds
     from rapid.simulator.vector_env import CompiledVectorEnv as CompiledVectorEnv
 
 Simulator = Literal["compiled", "highway-env"]
 
-__all__ = ["CompiledHighwayEnv", "CompiledVectorEnv", "make_env", "make_vec"]
+__all__ = ["CompiledHighwayEnv", "CompiledVectorEnv", "Sb3Worlds", "make_env", "make_sb3_vec", "make_vec"]
 
 
 _HOME = {
     "CompiledHighwayEnv": "rapid.simulator.env",
     "CompiledVectorEnv": "rapid.simulator.vector_env",
+    "Sb3Worlds": "rapid.simulator.sb3",
 }
+
+
+@overload
+def make_env(
+    scenario: str | Scenario,
+    simulator: Literal["compiled"] = "compiled",
+    render_mode: str | None = None,
+    config: Mapping[str, Any] | None = None,
+) -> "CompiledHighwayEnv": ...
+
+
+@overload
+def make_env(
+    scenario: str | Scenario,
+    simulator: Literal["highway-env"],
+    render_mode: str | None = None,
+    config: Mapping[str, Any] | None = None,
+) -> "ReferenceHighwayEnv": ...
+
+
+@overload
+def make_env(
+    scenario: str | Scenario,
+    simulator: Simulator,
+    render_mode: str | None = None,
+    config: Mapping[str, Any] | None = None,
+) -> "gymnasium.Env[Any, Any]": ...
 
 
 def make_env(
@@ -36,7 +67,8 @@ def make_env(
     """Return one world of a scenario as a Gymnasium environment.
 
     Args:
-        scenario: a name such as ``lane-3-density-2``, or a :class:`~rapid.scenarios.Scenario`.
+        scenario: a name such as ``lane-3-density-2``, a :class:`~rapid.scenarios.Scenario`, or HighwayEnv's own id
+            ``highway-v0`` or ``highway-fast-v0``: its defaults, observation and target speeds included.
         simulator: "compiled", or "highway-env" for the original with the same seeds, spaces and info.
         render_mode: as Gymnasium has it.
         config: keys of highway-env's configuration to override. ``observation`` and ``action`` are merged key by key
@@ -54,6 +86,45 @@ def make_env(
     return make_reference_env(scenario, render_mode, config)
 
 
+@overload
+def make_vec(
+    scenario: str | Scenario,
+    num_envs: int,
+    simulator: Literal["compiled"] = "compiled",
+    seed: int | None = None,
+    config: Mapping[str, Any] | None = None,
+    autoreset: bool = True,
+    processes: int = 1,
+    render_mode: str | None = None,
+) -> "CompiledVectorEnv": ...
+
+
+@overload
+def make_vec(
+    scenario: str | Scenario,
+    num_envs: int,
+    simulator: Literal["highway-env"],
+    seed: int | None = None,
+    config: Mapping[str, Any] | None = None,
+    autoreset: bool = True,
+    processes: int = 1,
+    render_mode: str | None = None,
+) -> "ReferenceVectorEnv": ...
+
+
+@overload
+def make_vec(
+    scenario: str | Scenario,
+    num_envs: int,
+    simulator: Simulator,
+    seed: int | None = None,
+    config: Mapping[str, Any] | None = None,
+    autoreset: bool = True,
+    processes: int = 1,
+    render_mode: str | None = None,
+) -> "gymnasium.vector.VectorEnv[Any, Any, Any]": ...
+
+
 def make_vec(
     scenario: str | Scenario,
     num_envs: int,
@@ -67,7 +138,8 @@ def make_vec(
     """Return `num_envs` worlds of a scenario as a Gymnasium vector environment.
 
     Args:
-        scenario: a name such as ``lane-3-density-2``, or a :class:`~rapid.scenarios.Scenario`.
+        scenario: a name such as ``lane-3-density-2``, a :class:`~rapid.scenarios.Scenario`, or HighwayEnv's own id
+            ``highway-v0`` or ``highway-fast-v0``: its defaults, observation and target speeds included.
         num_envs: how many.
         simulator: "compiled", or "highway-env" for the original with the same seeds, spaces and info.
         seed: seeds the first ``reset()`` that is called without one, world i with ``seed + i``.
@@ -93,6 +165,33 @@ def make_vec(
     return make_reference_vec(scenario, num_envs, seed, config, autoreset)
 
 
+def make_sb3_vec(
+    scenario: str | Scenario,
+    num_envs: int,
+    seed: int | None = None,
+    config: Mapping[str, Any] | None = None,
+    processes: int = 1,
+    render_mode: str | None = None,
+) -> "Sb3Worlds":
+    """Return `num_envs` compiled worlds as a vector environment of stable-baselines3.
+
+    The arguments are those of :func:`make_vec`; the worlds tell of their episodes as ``Monitor`` of
+    stable-baselines3 does.
+
+    Raises:
+        RapidError: stable-baselines3 is not installed, or as :func:`make_vec`.
+    """
+    try:
+        from rapid.simulator.sb3 import Sb3Worlds
+    except ImportError as error:
+        raise RapidError(
+            f"make_sb3_vec needs stable-baselines3 ({error}). Install it: pip install stable-baselines3"
+        ) from error
+    from rapid.simulator.vector_env import CompiledVectorEnv
+
+    return Sb3Worlds(CompiledVectorEnv(scenario, num_envs, seed, config, True, processes, render_mode))
+
+
 def _is_compiled(simulator: str) -> bool:
     if simulator not in ("compiled", "highway-env"):
         raise RapidError(
@@ -100,11 +199,6 @@ def _is_compiled(simulator: str) -> bool:
             "Expected 'compiled' or 'highway-env'."
         )
     return simulator == "compiled"
-
-
-def make_registered_vec(num_envs: int, scenario: str = "lane-3-density-2", **options: Any) -> Any:
-    """Return what ``gymnasium.make_vec("rapid/Highway-v0", num_envs, scenario=...)`` makes."""
-    return make_vec(scenario, num_envs, **options)
 
 
 def __getattr__(name: str) -> Any:
@@ -115,8 +209,4 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'rapid.simulator' has no attribute {name!r}")
 
 
-gymnasium.register(
-    id="rapid/Highway-v0",
-    entry_point="rapid.simulator.env:CompiledHighwayEnv",
-    vector_entry_point="rapid.simulator:make_registered_vec",
-)
+registration.register()

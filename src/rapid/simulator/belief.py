@@ -274,7 +274,7 @@ def _effort(draws: int, width: int, depth: int) -> _Effort:
 
 def _endless(settings: Settings, frames: int) -> Settings:
     """Return the settings with other frames per decision and no time limit: no plan foresees the end of an episode."""
-    return settings._replace(duration=math.inf, frames=frames, dt=settings.decision_time / frames)
+    return settings._replace(duration=math.inf, frames=frames, dt=settings.decision_time / max(frames, 1))
 
 
 def _decide(worlds: Worlds, settings: Settings, effort: _Effort, caution: float, rng: np.random.Generator) -> int:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
-from rapid.scenarios import ACTIONS, IDLE, Scenario, get_scenario
+from rapid.scenarios import ACTIONS, IDLE, Scenario
 from rapid.simulator import startup
+from rapid.simulator.configuration import Configuration, split_options
 from rapid.simulator.observation import (
     INFO_COLLISION,
     INFO_CRASHED,
@@ -20,8 +21,8 @@ from rapid.simulator.observation import (
     INFO_RIGHT,
     INFO_SPEED,
 )
-from rapid.simulator.render import RENDER_MODES, Frame, Window, draw, read_view
-from rapid.simulator.settings import Settings, merge_config, read_settings
+from rapid.simulator.render import RENDER_MODES, Frame, Window, draw
+from rapid.simulator.settings import Settings
 from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
 from rapid.simulator.step import (
     CONTINUE,
@@ -31,6 +32,7 @@ from rapid.simulator.step import (
     step_worlds,
 )
 from rapid.simulator.stream import set_generator, stream_of
+from rapid.simulator.views import HighwayViews, RoadView
 
 startup.load_numba()
 
@@ -48,11 +50,15 @@ class Forecast(NamedTuple):
     """(T,)"""
 
 
-class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
+class CompiledHighwayEnv(HighwayViews, gymnasium.Env[NDArray[np.float32], np.int64]):
     """highway-env's ``HighwayEnv``, compiled: same spawns, decisions and rewards, states equal up to rounding.
 
-    ``info`` holds ``speed`` [m/s], ``lane``, ``distance`` [m since reset], ``crashed`` and ``rewards`` (the terms).
-    As in highway-env, a step after the end of an episode drives on.
+    ``info`` holds ``speed`` [m/s], ``lane``, ``distance`` [m since reset], ``crashed``, ``rewards`` (the terms) and,
+    after a step, ``action``. As in highway-env, a step after the end of an episode drives on.
+
+    ``config`` is highway-env's configuration dict, complete. What is changed in it, by ``config[key] = value``, by
+    :meth:`configure` or by ``reset(options={"config": {...}})``, holds from the next reset on. Copies and pickles go on
+    as the original does; windows and recorders are not copied.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 1}  # noqa: RUF012 - as Gymnasium has it
@@ -75,33 +81,65 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             RapidError: an unknown scenario or render mode, or a configuration that the compiled simulator does not
                 cover.
         """
-        self.scenario = get_scenario(scenario) if isinstance(scenario, str) else scenario
-        self.config = merge_config(self.scenario.config(), config)
-        self.settings = read_settings(self.config, self.scenario.dynamics)
         self.render_mode = check_render_mode(render_mode, RENDER_MODES)
-        self.metadata = self.metadata | {"render_fps": max(round(1 / self.settings.decision_time), 1)}
-        self._view = read_view(self.config, self.settings) if render_mode else None
+        self._configuration = Configuration(scenario, config, render_mode)
+        self.scenario = self._configuration.task
         self._window: Window | None = None
         self._film: Any = None
         self._shown: Snapshot | None = None
+        self._build()
+
+    def _build(self) -> None:
+        """Make everything that follows from the settings; traffic comes with the next reset."""
+        self.settings = self._configuration.settings
         self.observation_space, self.action_space = spaces_of(self.settings)
         self.state: State = allocate(1, self.settings)
         self._out = allocate_outputs(1, self.settings)
+        self._road: RoadView | None = None
         self._ready = False
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+        self._tell_frames_per_second()
+
+    def _tell_frames_per_second(self) -> None:
+        seconds = self.settings.decision_time if self._film is None else self.settings.dt
+        self.metadata = self.metadata | {"render_fps": max(round(1 / seconds), 1)}
+        if self._film is not None and hasattr(self._film, "frames_per_sec"):
+            self._film.frames_per_sec = self.metadata["render_fps"]
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """highway-env's configuration; changes hold from the next reset on."""
+        return self._configuration.values
+
+    @config.setter
+    def config(self, values: dict[str, Any]) -> None:
+        self._configuration.values = values
+
+    def configure(self, config: Mapping[str, Any] | None) -> None:
+        """Change keys of the configuration, from the next reset on.
+
+        Raises:
+            RapidError: a key or a value that the compiled simulator does not cover; then nothing has changed.
+        """
+        self._configuration.configure(config)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode: the one that highway-env begins for `seed`, or, without one, the next of this stream.
 
+        Args:
+            seed: as Gymnasium has it.
+            options: ``{"config": {...}}`` changes keys of the configuration, for this and the following episodes.
+
         Raises:
-            RapidError: any option is given; there is none to give.
+            RapidError: an unknown option, or a configuration that the compiled simulator does not cover.
         """
-        if options:
-            raise RapidError(
-                f"reset() of the compiled simulator takes no options, got {sorted(options)}. To change the "
-                "configuration, make another environment with config={...}."
-            )
+        self._configuration.configure(split_options(options, ("config",)).get("config"))
+        if self._configuration.refresh():
+            self._build()
         super().reset(seed=seed)
         self.state.stream[0] = stream_of(self.np_random)
         reset_worlds(self.state, np.ones(1, np.bool_), self.settings, self._out)
@@ -133,7 +171,7 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             float(out.rewards[0]),
             bool(out.terminated[0]),
             bool(out.truncated[0]),
-            info_of(out.info[0]),
+            info_of(out.info[0]) | {"action": actions.item()},
         )
 
     def snapshot(self) -> Snapshot:
@@ -174,11 +212,21 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             RapidError: no render mode was chosen, or no episode has begun.
         """
         self._require_reset()
-        if self._view is None:
+        if self._configuration.view is None:
             raise RapidError('This environment draws nothing. Make it with render_mode="rgb_array" or "human".')
         if self.render_mode == "human":
             return self._show()
-        return draw(self._shown or snapshot(self.state, 0), self.settings, self._view)
+        return draw(self._shown or snapshot(self.state, 0), self.settings, self._configuration.view)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_window": None, "_film": None, "_road": None}
+
+    def __repr__(self) -> str:
+        under_way = f", {self.time:g} s driven" if self._ready else ""
+        return (
+            f"<CompiledHighwayEnv {self.scenario.name}: {self.settings.lanes} lanes, {self.settings.traffic + 1} "
+            f"vehicles, observations {self.observation_space.shape}, {len(self.settings.actions)} actions{under_way}>"
+        )
 
     def set_record_video_wrapper(self, wrapper: Any) -> None:
         """Let a ``gymnasium.wrappers.RecordVideo`` around this environment film every frame of a decision.
@@ -186,9 +234,7 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         Without this its videos have one picture per decision.
         """
         self._film = wrapper
-        self.metadata["render_fps"] = max(round(1 / self.settings.dt), 1)
-        if hasattr(wrapper, "frames_per_sec"):
-            wrapper.frames_per_sec = self.metadata["render_fps"]
+        self._tell_frames_per_second()
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -196,10 +242,10 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             self._window.close()
 
     def _show(self, world: Snapshot | None = None) -> None:
-        assert self._view is not None
+        assert self._configuration.view is not None
         if self._window is None:
-            self._window = Window(self._view, 1 / self.settings.dt)
-        self._window.show(draw(world or snapshot(self.state, 0), self.settings, self._view))
+            self._window = Window(self._configuration.view, 1 / self.settings.dt)
+        self._window.show(draw(world or snapshot(self.state, 0), self.settings, self._configuration.view))
 
     def _play(self, before: State, action: int) -> None:
         """Show or film the decision that was just driven."""
@@ -212,10 +258,6 @@ class CompiledHighwayEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         self._shown = None
         if self.render_mode == "human":
             self._show()
-
-    def _require_reset(self) -> None:
-        if not self._ready:
-            raise RapidError("No episode has begun. Call reset() first.")
 
 
 def check_render_mode(mode: str | None, modes: Sequence[str]) -> str | None:

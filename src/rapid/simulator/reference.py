@@ -8,8 +8,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rapid.errors import RapidError
-from rapid.scenarios import Scenario, get_scenario
-from rapid.simulator.settings import clock_column, merge_config, read_integer
+from rapid.scenarios import Scenario, get_task
+from rapid.simulator.configuration import merge_config
+from rapid.simulator.settings import DEFAULTS, clock_column, read_integer
 from rapid.simulator.state import (
     CAR_ROWS,
     CRASHED,
@@ -32,7 +33,7 @@ from rapid.simulator.stream import stream_of
 class ReferenceHighwayEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     """``highway-v0`` or ``highway-fast-v0`` with the info of the compiled simulator.
 
-    ``info["action"]`` is left out: at reset highway-env fills it with an unseeded sample.
+    ``info["action"]`` is left out at reset, where highway-env fills it with an unseeded sample that nobody took.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], clock: int = -1) -> None:
@@ -49,7 +50,8 @@ class ReferenceHighwayEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one decision."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._timed(observation), float(reward), bool(terminated), bool(truncated), self._info(info)
+        told = self._info(info) | {"action": int(action) if _is_whole(action) else action}
+        return self._timed(observation), float(reward), bool(terminated), bool(truncated), told
 
     def _timed(self, observation: Any) -> Any:
         if self._clock >= 0:
@@ -73,6 +75,11 @@ class ReferenceHighwayEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         }
 
 
+def _is_whole(action: Any) -> bool:
+    array = np.asarray(action)
+    return array.ndim == 0 and array.dtype.kind in "iu"
+
+
 class _StandStill(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Keep an ended world as it is, with a reward of 0, until it is reset."""
 
@@ -88,7 +95,8 @@ class _StandStill(gymnasium.Wrapper[Any, Any, Any, Any]):
             return observation, 0.0, terminated, truncated, info
         observation, reward, terminated, truncated, info = self.env.step(action)
         if terminated or truncated:
-            self._last = observation, terminated, truncated, info
+            standing = {key: value for key, value in info.items() if key != "action"}
+            self._last = observation, terminated, truncated, standing
         return observation, float(reward), terminated, truncated, info
 
 
@@ -126,12 +134,13 @@ def make_reference_env(
     Raises:
         RapidError: an unknown scenario, or highway-env is not installed.
     """
-    chosen = get_scenario(scenario) if isinstance(scenario, str) else scenario
+    chosen = get_task(scenario) if isinstance(scenario, str) else scenario
     try:
         import highway_env  # noqa: F401 - registers the ids  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
         raise RapidError("highway-env is not installed. Run: pip install highway-env") from error
-    merged = merge_config(chosen.config(), config)
+    parts = {key: DEFAULTS[chosen.dynamics][key] for key in ("observation", "action")}
+    merged = merge_config(parts | chosen.config(), config)
     made = gymnasium.make(
         chosen.env_id,
         render_mode=render_mode,

@@ -1,6 +1,7 @@
 """From highway-env's configuration dict to the numbers that the kernels read."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -121,19 +122,6 @@ class Settings(NamedTuple):
     """The column to which, in the ego's row, the share of the time that has passed is added; -1 for none."""
 
 
-def merge_config(base: Mapping[str, Any], overrides: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return `base` with `overrides` on top.
-
-    ``observation`` and ``action`` are merged key by key unless the override names a ``type``; then it stands alone, as
-    it would in highway-env.
-    """
-    merged = dict(base)
-    for key, value in (overrides or {}).items():
-        partial = key in ("observation", "action") and isinstance(value, Mapping) and "type" not in value
-        merged[key] = {**base.get(key, {}), **value} if partial else value
-    return merged
-
-
 def read_settings(config: Mapping[str, Any], dynamics: Dynamics = "v0") -> Settings:
     """Return the numbers behind a configuration of ``highway-v0`` or (``dynamics="fast"``) ``highway-fast-v0``.
 
@@ -167,9 +155,10 @@ def read_settings(config: Mapping[str, Any], dynamics: Dynamics = "v0") -> Setti
     policy_frequency = _number(full, "policy_frequency", above=0)
     frames = int(simulation_frequency // policy_frequency)
     if frames < 1:
-        raise RapidError(
+        warnings.warn(
             f"simulation_frequency={simulation_frequency:g} Hz is below policy_frequency={policy_frequency:g} Hz, so "
-            "no frame would pass between decisions. Make it at least as high."
+            "no frame passes between decisions and nothing moves, as in highway-env. Make it at least as high.",
+            stacklevel=2,
         )
     low_speed, high_speed = _interval(full["reward_speed_range"], "reward_speed_range")
     weights = {key: _number(full, key) for key in ("collision_reward", "right_lane_reward", "high_speed_reward")}

@@ -53,6 +53,10 @@ class State(NamedTuple):
         """Return a copy of the worlds at the given indices, in that order."""
         return State(self.cars[worlds], self.tags[worlds], self.world[worlds], self.stream[worlds])
 
+    def part(self, first: int, end: int) -> "State":
+        """Return worlds `first` to `end`, in the same memory."""
+        return State(self.cars[first:end], self.tags[first:end], self.world[first:end], self.stream[first:end])
+
     @property
     def bytes_per_world(self) -> int:
         """Memory that one world takes."""

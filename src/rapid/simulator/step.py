@@ -68,7 +68,8 @@ def advance_world(cars, tags, world, action, settings):
         settings: the configuration.
     """
     world[TIME] += settings.decision_time
-    command_ego(cars, tags, world, action, settings)
+    if settings.frames > 0:
+        command_ego(cars, tags, world, action, settings)
     for _ in range(settings.frames):
         act(cars, tags, settings)
         move(cars, tags, settings)

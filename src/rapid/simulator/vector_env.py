@@ -10,7 +10,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
-from rapid.scenarios import Scenario, get_scenario
+from rapid.scenarios import Scenario
+from rapid.simulator.configuration import Configuration, split_options
 from rapid.simulator.env import Forecast, check_actions, check_render_mode, forecast, spaces_of
 from rapid.simulator.observation import (
     INFO_COLLISION,
@@ -23,9 +24,9 @@ from rapid.simulator.observation import (
     INFO_SPEED,
 )
 from rapid.simulator.pool import WorldPool
-from rapid.simulator.render import Frame, draw, read_view
-from rapid.simulator.settings import merge_config, read_integer, read_settings
-from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
+from rapid.simulator.render import Frame, draw
+from rapid.simulator.settings import read_integer
+from rapid.simulator.state import TERMINATED, TRUNCATED, Snapshot, State, allocate, restore, snapshot
 from rapid.simulator.step import AUTORESET, FREEZE, allocate_outputs, reset_worlds, seed_worlds, step_worlds
 from rapid.simulator.stream import stream_of
 
@@ -41,10 +42,13 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
     ``info`` with the arrays ``speed`` [m/s], ``lane``, ``distance`` [m since reset], ``crashed`` and the dict
     ``rewards`` of the terms. Where a world was reset, these describe its new episode, ``final_obs`` (an object array,
     None elsewhere) holds the last observation of the old one and ``final_info`` its info. Every entry has a mask with
-    a leading underscore, as Gymnasium defines it.
+    a leading underscore, as Gymnasium defines it. ``action`` is the action that a world's episode took.
 
     Without ``autoreset`` an ended world stands still: it keeps its observation and flags and earns 0, until it is
     chosen by ``reset(options={"reset_mask": mask})`` or everything is reset.
+
+    ``config`` is highway-env's configuration dict, complete, and the same for all worlds. What is changed in it holds
+    from the next reset of all worlds on. Copies and pickles go on as the original does, with processes of their own.
     """
 
     def __init__(
@@ -72,28 +76,52 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             RapidError: an unknown scenario, a configuration that the compiled simulator does not cover, no worlds, or
                 processes that cannot be started.
         """
-        self.scenario = get_scenario(scenario) if isinstance(scenario, str) else scenario
-        self.config = merge_config(self.scenario.config(), config)
-        self.settings = read_settings(self.config, self.scenario.dynamics)
-        self.num_envs = read_integer({"num_envs": num_envs}, "num_envs", 1, 1_000_000)
         self.render_mode = check_render_mode(render_mode, ("rgb_array",))
-        self._view = read_view(self.config, self.settings) if render_mode else None
+        self._configuration = Configuration(scenario, config, render_mode)
+        self.scenario = self._configuration.task
+        self.num_envs = read_integer({"num_envs": num_envs}, "num_envs", 1, 1_000_000)
         self._mode = AUTORESET if autoreset else FREEZE
+        self._processes = read_integer({"processes": processes}, "processes", 1, 1024)
+        self._pool: WorldPool | None = None
+        self._first_seed = seed
+        self._seeded = np.zeros(self.num_envs, np.bool_)
+        self._build()
+
+    def _build(self) -> None:
+        """Make everything that follows from the settings; traffic comes with the next reset."""
+        self.settings = self._configuration.settings
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": max(round(1 / self.settings.decision_time), 1),
-            "autoreset_mode": AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED,
+            "autoreset_mode": AutoresetMode.SAME_STEP if self._mode == AUTORESET else AutoresetMode.DISABLED,
         }
         self.single_observation_space, self.single_action_space = spaces_of(self.settings)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        processes = read_integer({"processes": processes}, "processes", 1, 1024)
-        self._pool = WorldPool(self.num_envs, self.settings, self._mode, processes) if processes > 1 else None
+        if self._pool is not None:
+            self._pool.close()
+        several = self._processes > 1
+        self._pool = WorldPool(self.num_envs, self.settings, self._mode, self._processes) if several else None
         self.state: State = self._pool.state if self._pool else allocate(self.num_envs, self.settings)
-        self._first_seed = seed
-        self._seeded = np.zeros(self.num_envs, np.bool_)
         self._ready = np.zeros(self.num_envs, np.bool_)
         self._observations = np.zeros((self.num_envs, self.settings.rows, len(self.settings.features)), np.float32)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """highway-env's configuration; changes hold from the next reset of all worlds on."""
+        return self._configuration.values
+
+    @config.setter
+    def config(self, values: dict[str, Any]) -> None:
+        self._configuration.values = values
+
+    def configure(self, config: Mapping[str, Any] | None) -> None:
+        """Change keys of the configuration, from the next reset of all worlds on.
+
+        Raises:
+            RapidError: a key or a value that the compiled simulator does not cover; then nothing has changed.
+        """
+        self._configuration.configure(config)
 
     def reset(
         self,
@@ -106,12 +134,15 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         Args:
             seed: with a whole number, world i is seeded with ``seed + i``; with a list, each world with its own.
                 Without one, or where the list says None, the world's stream goes on.
-            options: ``{"reset_mask": mask}`` or nothing.
+            options: ``reset_mask``, and ``config`` with keys of the configuration to change.
 
         Raises:
-            RapidError: a seed below 0, a list or a mask of another length, or an unknown option.
+            RapidError: a seed below 0, a list or a mask of another length, an unknown option, or a configuration that
+                the compiled simulator does not cover or that was changed while some worlds go on.
         """
-        chosen = self._chosen(options)
+        given = split_options(options, ("reset_mask", "config"))
+        chosen = self._chosen(given.get("reset_mask"))
+        self._configure(given.get("config"), chosen)
         if seed is None and self._first_seed is not None:
             seed = self._first_seed
         self._first_seed = None
@@ -134,6 +165,7 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         """
         self._require_reset()
         checked = check_actions(actions, self.settings, (self.num_envs,))
+        still = self.state.world[:, [TERMINATED, TRUNCATED]].any(axis=1)  # before the step
         if self._pool is not None:
             out = self._pool.step(checked)
         else:
@@ -148,10 +180,11 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             info = {
                 "final_obs": finals,
                 "_final_obs": ended.copy(),
-                "final_info": _info(out.final_info, ended),
+                "final_info": _info(out.final_info, ended) | _acted(checked, ended),
                 "_final_info": ended.copy(),
             }
-        info |= _info(out.info, np.ones(self.num_envs, np.bool_))
+        acted = ~ended if self._mode == AUTORESET else ~still
+        info |= _info(out.info, np.ones(self.num_envs, np.bool_)) | _acted(checked, acted)
         self._observations = out.observations
         return out.observations.copy(), out.rewards, out.terminated, out.truncated, info
 
@@ -201,15 +234,34 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             RapidError: no render mode was chosen, or a world has not begun.
         """
         self._require_reset()
-        if self._view is None:
+        if self._configuration.view is None:
             raise RapidError('This environment draws nothing. Make it with render_mode="rgb_array".')
         count = min(self.num_envs, RENDERED)
-        return tuple(draw(snapshot(self.state, i), self.settings, self._view) for i in range(count))
+        return tuple(draw(snapshot(self.state, i), self.settings, self._configuration.view) for i in range(count))
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the processes, if there are several. Forgetting the environment does the same."""
         if self._pool is not None:
             self._pool.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Processes and the memory that they share stay with the original.
+        return self.__dict__ | {"_pool": None, "state": self.state.copy()}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
+        if self._processes > 1:
+            self._pool = WorldPool(self.num_envs, self.settings, self._mode, self._processes)
+            for memory, array in zip(self._pool.state, self.state, strict=True):
+                memory[:] = array
+            self.state = self._pool.state
+
+    def __repr__(self) -> str:
+        shape = self.single_observation_space.shape
+        return (
+            f"<CompiledVectorEnv of {self.num_envs} worlds of {self.scenario.name}: {self.settings.lanes} lanes, "
+            f"{self.settings.traffic + 1} vehicles each, observations {shape}, {len(self.settings.actions)} actions>"
+        )
 
     def _seed(self, seed: int | Sequence[int | None] | None, chosen: Mask) -> None:
         if seed is None:
@@ -235,14 +287,20 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
                 self.state.stream[i] = stream_of(np.random.Generator(np.random.PCG64(value)))
         self._seeded |= chosen
 
-    def _chosen(self, options: dict[str, Any] | None) -> Mask:
-        unknown = sorted(set(options or {}) - {"reset_mask"})
-        if unknown:
+    def _configure(self, changes: Mapping[str, Any] | None, chosen: Mask) -> None:
+        self._configuration.configure(changes)
+        if chosen.all():
+            if self._configuration.refresh():
+                streams = self.state.stream.copy()
+                self._build()
+                self.state.stream[:] = streams
+        elif self._configuration.changed:
             raise RapidError(
-                f"reset() of the compiled simulator takes the option 'reset_mask' only, got {unknown}. To change the "
-                "configuration, make another environment with config={...}."
+                "The configuration was changed, but only some worlds are reset, and all have the same one. Reset all "
+                "worlds once, without a reset_mask."
             )
-        mask = (options or {}).get("reset_mask")
+
+    def _chosen(self, mask: Any) -> Mask:
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
         array = np.asarray(mask)
@@ -253,6 +311,10 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             )
         return array.copy()
 
+    def begun(self, index: int) -> bool:
+        """Return whether a world has begun an episode."""
+        return bool(self._ready[index])
+
     def _check_index(self, index: int) -> None:
         if not 0 <= index < self.num_envs:
             raise RapidError(f"There is no world {index}; expected 0 to {self.num_envs - 1}.")
@@ -260,6 +322,10 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
     def _require_reset(self) -> None:
         if not self._ready.all():
             raise RapidError("No episode has begun in some worlds. Call reset() first.")
+
+
+def _acted(actions: NDArray[np.int64], mask: Mask) -> dict[str, Any]:
+    return {"action": np.where(mask, actions, 0), "_action": mask} if mask.any() else {}
 
 
 def _info(info: NDArray[np.float64], mask: Mask) -> dict[str, Any]:

@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
-from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER, get_scenario
+from rapid.scenarios import FASTER, HIGHWAY_ENV_IDS, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER, get_task
 from rapid.simulator.env import CompiledHighwayEnv
 from rapid.simulator.reference import copy_world, make_reference_env
 from rapid.simulator.state import CRASHED, HEADING, LANE, SPEED, SPEED_INDEX, TARGET_LANE, X, Y
 from rapid.simulator.thresholds import nearest_threshold
+from rapid.simulator.time_limits import TimeLimits, compare_time_limits
 
 REWARD_TOLERANCE = 1e-9
 STATE_TOLERANCE = 1e-6
@@ -59,6 +60,8 @@ VARIANTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("lane-4-density-0.5-fast:progress", {"vehicles_count": 40}),
     ("lane-3-density-4-fast", {"ego_spacing": 1, "offroad_terminal": True, "initial_lane_id": 1}),
     ("lane-4-density-2-fast", {"action": {"target_speeds": [20, 25, 30]}, "normalize_reward": False}),
+    *((name, {}) for name in HIGHWAY_ENV_IDS),
+    ("highway-fast-v0", {"policy_frequency": 5, "simulation_frequency": 15, "duration": 8}),
     (
         "lane-3-density-1-fast",
         {"observation": {"absolute": False, "normalize": True, "see_behind": False, "vehicles_count": 8}},
@@ -93,6 +96,8 @@ class Verification:
     mismatches: list[Mismatch] = field(default_factory=list[Mismatch])
     max_reward_difference: float = 0.0
     max_state_difference: float = 0.0
+    time_limits: TimeLimits | None = None
+    """Episodes' ends at many frequencies, if they were compared."""
     max_observation_ulps: float = 0.0
     """Largest difference between observations, in units of the last place of the larger float32."""
 
@@ -113,6 +118,7 @@ class Verification:
             and all(mismatch.margin <= THRESHOLD_TOLERANCE for mismatch in self.mismatches)
             and self.max_reward_difference <= REWARD_TOLERANCE
             and self.max_state_difference <= STATE_TOLERANCE
+            and not (self.time_limits and self.time_limits.differences)
         )
 
     def verdict(self) -> str:
@@ -130,6 +136,11 @@ class Verification:
             " m, rad, m/s)",
             f"  largest difference of observations {self.max_observation_ulps:.0f} float32 roundings",
         ]
+        if self.time_limits:
+            compared, differences = self.time_limits
+            said = f"at {compared} pairs of frequencies" + (f", {len(differences)} differ" if differences else ", all")
+            lines.append(f"  time limits equal to highway-env's {said}")
+            lines += [f"  time limit: {words}" for words in differences[:20]]
         for mismatch in self.mismatches[:20]:
             case = mismatch.case
             lines.append(
@@ -145,7 +156,7 @@ def plan_cases(
     """Return `episodes` cases round the scenarios, then the drivers; every other one drives on after a crash."""
     variants: Sequence[tuple[str, Mapping[str, Any]]] = VARIANTS
     if scenarios:
-        variants = [(get_scenario(name).name, {}) for name in scenarios]
+        variants = [(get_task(name).name, {}) for name in scenarios]
     rounds = product(range(episodes), DRIVERS, variants)
     return [
         Case(name, config, seed + number, driver, number % 2 == 0, max_steps)
@@ -161,6 +172,7 @@ def verify(
     max_steps: int | None = None,
     processes: int = 1,
     plain_math: bool = False,
+    time_limits: bool = False,
     progress: Progress | None = None,
 ) -> Verification:
     """Compare the compiled simulator with the installed highway-env.
@@ -177,6 +189,7 @@ def verify(
         max_steps: cut episodes after so many decisions.
         processes: highway-env makes a few decisions a second, so more processes help.
         plain_math: let NumPy use the C library's functions, in processes of their own.
+        time_limits: also compare when episodes end, at many frequencies.
         progress: called after each episode.
 
     Raises:
@@ -199,6 +212,8 @@ def verify(
         environment = {_DISABLE: " ".join(_numpy_extensions())} if plain_math else {}
         with _environment(environment), ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
             gather(pool.map(compare, cases))
+    if time_limits:
+        total.time_limits = compare_time_limits()
     return total
 
 
