@@ -165,7 +165,7 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         """
         self._require_reset()
         checked = check_actions(actions, self.settings, (self.num_envs,))
-        still = self.state.world[:, [TERMINATED, TRUNCATED]].any(axis=1)  # before the step
+        still = (self.state.world[:, TERMINATED] != 0.0) | (self.state.world[:, TRUNCATED] != 0.0)  # before the step
         if self._pool is not None:
             out = self._pool.step(checked)
         else:
