@@ -60,5 +60,5 @@ $(VENV)/.installed: $(VENV)/.torch pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo 'Installing the development tools ...'
-	@$(PIP) install -qq -c constraints.txt -e '.[dev,minari,export]'
+	@$(PIP) install -qq -c constraints.txt -e '.[dev,minari,export,sb3]'
 	@touch $@

@@ -254,6 +254,9 @@ def test_views_cannot_be_written_and_say_what_they_show() -> None:
     with pytest.raises(AttributeError, match="ego"):
         _ = env.road.vehicles[1].speed_index
     assert not hasattr(env.vehicle, "plan_route_to")
+    copied = copy.deepcopy(env.vehicle)  # with a world of its own
+    env.step(3)
+    assert copied.position[0] < env.vehicle.position[0]
 
 
 def test_what_is_shown_in_a_notebook_says_what_it_is() -> None:

@@ -159,6 +159,9 @@ class _World(HighwayViews):
     def __init__(self, worlds: CompiledVectorEnv, index: int) -> None:
         self._worlds, self._index, self._road = worlds, index, None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_road": None}
+
     @property
     def state(self) -> State:  # pyright: ignore[reportIncompatibleVariableOverride]  # a view of many
         return self._worlds.state.part(self._index, self._index + 1)

@@ -144,6 +144,9 @@ class VehicleView:
             f"vehicle.{name} cannot be set: the vehicles of the compiled simulator can only be read. {USE_REFERENCE}"
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return VehicleView, (self._owner, self._index)
+
     def __repr__(self) -> str:
         x, y = self.position
         who = "the ego" if self._index == 0 else f"vehicle {self._index}"
