@@ -12,9 +12,9 @@ def interrupted(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, when: s
     """Expect the block to end in a KeyboardInterrupt `before` or `after` the first call of `module.name`."""
     real = getattr(module, name)
 
-    def stop(*arguments: Any) -> None:
+    def stop(*arguments: Any, **options: Any) -> None:
         if when == "after":
-            real(*arguments)
+            real(*arguments, **options)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

@@ -6,6 +6,7 @@ import os
 import tomllib
 import types
 import typing
+from collections.abc import Iterator
 from functools import reduce
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -179,3 +180,25 @@ def _toml_value(value: Any) -> str:
         # TOML's basic strings escape as JSON's do, except for DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return f"[{', '.join(map(_toml_value, value))}]"
+
+
+def differences(old: Any, new: Any, limit: int = 6) -> str:
+    """Return which of two nested settings differ, each as ``path: old there, new now``; nothing if they are equal."""
+    found = list(_differing(old, new, ""))
+    more = f"; and {len(found) - limit} more" if len(found) > limit else ""
+    return "; ".join(found[:limit]) + more
+
+
+def _differing(old: Any, new: Any, where: str) -> Iterator[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            yield from _differing(old.get(key), new.get(key), f"{where}.{key}" if where else str(key))
+        return
+    old, new = (list(value) if isinstance(value, tuple) else value for value in (old, new))
+    if old != new:
+        yield f"{where}: {_short(old)} there, {_short(new)} now"
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

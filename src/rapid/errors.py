@@ -22,6 +22,10 @@ def sentence(text: str) -> str:
     return text if text.endswith((".", "!", "?", "…")) else f"{text}."
 
 
+class DamagedError(RapidError):
+    """A file of our own that is not what was written: cut off, overwritten or edited."""
+
+
 def did_you_mean(name: str, choices: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the choice nearest to `name`, or ``"."``."""
     near = get_close_matches(name, list(choices), n=1, cutoff=0.4)

@@ -86,6 +86,11 @@ def task(title: str, total: float, unit: str, stream: TextIO | None = None) -> G
     work.finish()
 
 
+def warn(text: str) -> None:
+    """Say on standard error what went otherwise than a user would expect, and is dealt with."""
+    print(f"rapid: {text}", file=sys.stderr, flush=True)
+
+
 def _shown(amount: float) -> str:
     """Return a count in full, a million steps as 1000000, and parts of megabytes to a tenth."""
     return f"{round(amount, 1):.15g}"

@@ -11,9 +11,9 @@ from rapid.agents.open import open_agent
 from rapid.config import Config
 from rapid.data.dataset import Dataset
 from rapid.data.fallbacks import fallback_notice
-from rapid.data.journal import exclusive
 from rapid.data.shipped import SHIPPED
 from rapid.errors import RapidError, did_you_mean
+from rapid.locks import exclusive
 from rapid.networks.q_network import check_widening
 from rapid.phases.adapt import adapt_agent
 from rapid.phases.checks import check
@@ -46,9 +46,9 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
     _check_whole(config)
     if restart and restart not in STEPS:
         raise RapidError(f"Unknown step '{restart}'{did_you_mean(restart, STEPS)} Steps: {', '.join(STEPS)}.")
-    home = RunDirectory(directory, config, STEPS)
-    with exclusive(home.path / "lock"):
-        return _run_steps(config, home, restart, say)
+    # Before the first look at it: of two runs with other settings the second must see what the first is.
+    with exclusive(directory):
+        return _run_steps(config, RunDirectory(directory, config, STEPS), restart, say)
 
 
 def _run_steps(config: Config, home: RunDirectory, restart: str, say: Callable[[str], None]) -> Path:

@@ -19,10 +19,12 @@ from typing import Any
 
 import rapid
 from rapid.config import Config, PpoConfig, without_place
-from rapid.config_io import apply_overrides, to_dict, to_toml
-from rapid.errors import RapidError, did_you_mean
+from rapid.config_io import apply_overrides, differences, to_dict, to_toml
+from rapid.errors import DamagedError, RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
+from rapid.locks import is_empty
 from rapid.presets import of_file, without_presets
+from rapid.progress import warn
 
 FORMAT = 1
 STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
@@ -70,7 +72,7 @@ def _git(directory: Path, *arguments: str) -> str:
 
 
 class RunDirectory:
-    """The directory of one run, opened for a list of `steps`.
+    """The directory of one run, opened for a list of `steps`. Whoever opens it holds its lock.
 
     Raises:
         RapidError: the directory was made by other settings, by another format, is no run's, or cannot be written.
@@ -82,7 +84,7 @@ class RunDirectory:
         manifest = self.path / "run.json"
         if manifest.exists():
             self._check_same(read_json(manifest, "run manifest"), config)
-        elif self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+        elif self.path.exists() and (not self.path.is_dir() or not is_empty(self.path)):
             raise RapidError(
                 f"'{self.path}' exists and is not the directory of a run. Choose another --directory, or empty it."
             )
@@ -97,6 +99,7 @@ class RunDirectory:
                     "command": sys.argv[1:],
                     "started": datetime.now(UTC).isoformat(timespec="seconds"),
                 },
+                sealed=True,
             )
             write_text(self.path / "config.toml", to_toml(to_dict(config)))
 
@@ -116,26 +119,26 @@ class RunDirectory:
         # There was no PPO before a run's settings told of it.
         base = replace(base, adapt=replace(base.adapt, ppo=PpoConfig()))
         there = apply_overrides(base, without_presets(made), source=f"'{self.path / 'run.json'}'")
-        changes = _differences(to_dict(without_place(there)), to_dict(without_place(config)))
+        changes = differences(to_dict(without_place(there)), to_dict(without_place(config)))
         if changes:
             raise RapidError(
-                f"The run in '{self.path}' was made with other settings: {'; '.join(changes[:6])}"
-                f"{f'; and {len(changes) - 6} more' if len(changes) > 6 else ''}. Nothing was changed. Repeat its own "
-                f"settings (rapid run --config {self.path / 'config.toml'} --directory {self.path}), or choose another "
+                f"The run in '{self.path}' was made with other settings: {changes}. Nothing was changed. Repeat "
+                f"its own settings (rapid run --config {self.path / 'config.toml'} --directory {self.path}), or choose another "
                 "--directory."
             )
 
     def is_done(self, step: str) -> bool:
         """Whether `step` and all before it were finished."""
-        return all(self._mark(before).exists() for before in self.steps[: self.steps.index(step) + 1])
+        return all(self._read_mark(before) for before in self.steps[: self.steps.index(step) + 1])
 
     def finish(self, step: str, seconds: float, **facts: Any) -> None:
         """Mark `step` as done, with the time it took and facts about it."""
-        write_json(self._mark(step), {"step": step, "seconds": round(seconds, 2), "time": time.time(), **facts})
+        record = {"step": step, "seconds": round(seconds, 2), "time": time.time(), **facts}
+        write_json(self._mark(step), record, sealed=True)
 
     def facts(self, step: str) -> dict[str, Any]:
         """Return what :meth:`finish` wrote, or nothing if the step is not done."""
-        return read_json(self._mark(step), "step record") if self.is_done(step) else {}
+        return self._read_mark(step) if self.is_done(step) else {}
 
     def restart_from(self, step: str) -> None:
         """Forget `step` and all later ones: their marks and their folders.
@@ -153,19 +156,18 @@ class RunDirectory:
             if (self.path / name).exists():
                 shutil.rmtree(self.path / name)
 
+    def _read_mark(self, step: str) -> dict[str, Any]:
+        """Return what a step left when it was done; nothing if it did not, or if its mark is damaged."""
+        path = self._mark(step)
+        if not path.exists():
+            return {}
+        try:
+            return dict(read_json(path, "step record"))
+        except (DamagedError, TypeError, ValueError):
+            # A step finds what it has done already, so that to do it again costs little.
+            warn(f"The step record '{path}' is damaged. The step '{step}' is done again.")
+            path.unlink()
+            return {}
+
     def _mark(self, step: str) -> Path:
         return self.path / "steps" / f"{step}.json"
-
-
-def _differences(old: Any, new: Any, where: str = "") -> list[str]:
-    """Return the settings that differ, each as ``path: old -> new``."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        found: list[str] = []
-        for key in [*old, *(key for key in new if key not in old)]:
-            found += _differences(old.get(key), new.get(key), f"{where}.{key}" if where else key)
-        return found
-    if isinstance(new, tuple):
-        new = list(new)
-    if isinstance(old, tuple):
-        old = list(old)
-    return [] if old == new else [f"{where}: {old!r} there, {new!r} now"]

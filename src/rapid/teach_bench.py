@@ -17,8 +17,7 @@ import torch
 from rapid.agents.open import open_agent
 from rapid.config import Config, TeacherConfig
 from rapid.config_io import apply_overrides, load_toml, to_dict, validate
-from rapid.data.journal import exclusive
-from rapid.errors import RapidError, did_you_mean
+from rapid.errors import DamagedError, RapidError, did_you_mean
 from rapid.evaluation.teacher_summary import (
     TeacherSummary,
     summarize_teachers,
@@ -28,8 +27,9 @@ from rapid.evaluation.teacher_summary import (
 )
 from rapid.evaluation.teachers import SCHEMA, TeacherRow, drive_teacher, load_teacher_rows, save_teacher_rows
 from rapid.files import read_json, sha256, write_json, write_text
+from rapid.locks import exclusive, is_empty
 from rapid.presets import preset
-from rapid.progress import task
+from rapid.progress import task, warn
 from rapid.report.figures import save_figure, teachers_figure
 from rapid.runs import commit, versions
 from rapid.scenarios import get_scenario
@@ -142,8 +142,6 @@ def compare_teachers(
     """
     entrants, seeds = _check(config, specs, scenarios, spawns, spawn_set, lockstep)
     scenarios = [get_scenario(name).name for name in scenarios]
-    if out.exists() and (not out.is_dir() or not _is_ours(out)):
-        raise RapidError(f"'{out}' holds something else than a comparison of teachers. Choose another --out.")
     request = {
         "format": _FORMAT,
         "teachers": {entrant.spec: to_dict(entrant.teacher) if entrant.teacher else {} for entrant in entrants},
@@ -155,9 +153,10 @@ def compare_teachers(
         "commit": commit(),
     }
     torch.set_num_threads(config.threads)
-    out.mkdir(parents=True, exist_ok=True)
-    with exclusive(out / "lock"):
-        write_json(out / "request.json", request)
+    with exclusive(out):
+        if not _is_ours(out):
+            raise RapidError(f"'{out}' holds something else than a comparison of teachers. Choose another --out.")
+        write_json(out / "request.json", request, sealed=True)
         rows: list[TeacherRow] = []
         identities: dict[str, Any] = {}
         cells = [(entrant, scenario) for scenario in scenarios for entrant in entrants]
@@ -166,7 +165,8 @@ def compare_teachers(
             for (entrant, scenario), decisions in zip(cells, longest, strict=True):
                 part = out / "parts" / f"{_key(entrant, scenario, seeds, config)}.parquet"
                 facts = part.with_suffix(".json")
-                if part.exists() and facts.exists():
+                kept = _kept(part, facts)
+                if kept:
                     work.skip(decisions)
                 else:
                     work.note(f"{entrant.spec}, {scenario}")
@@ -183,12 +183,13 @@ def compare_teachers(
                         work.advance,
                     )
                     describe = getattr(teacher, "describe", lambda: {"backend": PLANNER})
-                    write_json(facts, describe())
+                    write_json(facts, describe(), sealed=True)
                     save_teacher_rows(part, found)
                     # The next one may be as large: it needs the room.
                     del teacher
-                rows += load_teacher_rows(part)
-                identities.setdefault(scenario, {})[entrant.spec] = read_json(facts, "identity of a teacher")
+                    kept = load_teacher_rows(part), read_json(facts, "identity of a teacher")
+                rows += kept[0]
+                identities.setdefault(scenario, {})[entrant.spec] = kept[1]
         return _write(out, rows, request, identities)
 
 
@@ -234,11 +235,26 @@ def _check(
     return entrants, seeds
 
 
+def _kept(part: Path, facts: Path) -> tuple[list[TeacherRow], Any] | None:
+    """Return what an earlier call measured of a teacher, and who that was; None if it has to be driven."""
+    if not (part.exists() and facts.exists()):
+        return None
+    try:
+        return load_teacher_rows(part), read_json(facts, "identity of a teacher")
+    except DamagedError as error:
+        warn(f"{error} It is driven again.")
+        return None
+
+
 def _is_ours(out: Path) -> bool:
     path = out / "request.json"
     if not path.exists():
-        return all(found.name == "lock" for found in out.iterdir())
-    request = read_json(path, "record of the comparison")
+        return is_empty(out)
+    try:
+        request = read_json(path, "record of the comparison")
+    except DamagedError:
+        # What was measured is kept under its own hash: nothing depends on this file.
+        return (out / "parts").is_dir()
     return isinstance(request, dict) and request.get("format") == _FORMAT
 
 

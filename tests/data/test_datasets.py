@@ -11,6 +11,7 @@ from rapid.data.dataset import Dataset, episode_returns, join, load_dataset, mix
 from rapid.data.tables import LOG_SCHEMA, current_log
 from rapid.data.transitions import RANDOM, TEACHER, Transitions
 from rapid.errors import RapidError
+from rapid.files import read_json
 
 SCENARIO = "lane-3-density-2"
 
@@ -68,8 +69,15 @@ def test_a_damaged_dataset_is_refused(tmp_path):
     with pytest.raises(RapidError, match="lacks its file"):
         load_dataset(tmp_path)
     path.write_bytes(whole)
-    meta = json.loads((tmp_path / "dataset.json").read_text())
+    meta = read_json(tmp_path / "dataset.json")
+    files = meta["files"]
     for change, message in (
+        ({"files": {}}, "does not name the SHA-256 of 'transitions.parquet'"),
+        ({"files": {"transitions.parquet": files["transitions.parquet"]}}, "SHA-256 of 'teacher_log.parquet'"),
+        ({"files": files | {"transitions.parquet": {"rows": 200, "bytes": len(whole)}}}, "sha256"),
+        ({"files": files | {"../elsewhere": files["transitions.parquet"]}}, "which no dataset has"),
+        ({"mixture": [1]}, "'mixture' is"),
+        ({"drivers": {"teacher": "me"}}, "drivers"),
         ({"schema_version": 2}, "schema version 2"),
         ({"format": "other"}, "does not describe"),
         ({"scenario": "lane-99-density-2"}, "Impossible scenario"),
@@ -78,6 +86,21 @@ def test_a_damaged_dataset_is_refused(tmp_path):
         (tmp_path / "dataset.json").write_text(json.dumps(meta | change))
         with pytest.raises(RapidError, match=message):
             load_dataset(tmp_path)
+
+
+def test_facts_that_were_edited_are_noticed(tmp_path):
+    save_dataset(mix(teacher(), random(), 0.25, 100, 0, "batch"), tmp_path)
+    path = tmp_path / "dataset.json"
+    path.write_text(path.read_text().replace('"p": 0.25', '"p": 0.75'))
+    with pytest.raises(RapidError, match="not what was written"):
+        load_dataset(tmp_path)
+
+
+def test_a_dataset_in_the_place_of_another_takes_nothing_over_from_it(tmp_path):
+    save_dataset(teacher(), tmp_path)
+    save_dataset(replace(teacher(), log=None), tmp_path)
+    assert load_dataset(tmp_path).log is None
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset.json", "transitions.parquet"]
 
 
 def test_a_dataset_with_impossible_values_is_not_written(tmp_path):

@@ -120,7 +120,7 @@ def test_interrupted_anywhere_it_ends_with_the_same_bytes(tmp_path, whole, seed)
 
 
 @pytest.mark.parametrize(
-    ("module", "name"), [(driving, "write_parquet"), (collection, "save_dataset"), (collection.shutil, "rmtree")]
+    ("module", "name"), [(driving.Parts, "keep"), (collection, "save_dataset"), (collection, "_remove")]
 )
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_interrupted_while_writing_it_ends_with_the_same_bytes(tmp_path, whole, monkeypatch, module, name, when):

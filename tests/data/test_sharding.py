@@ -115,18 +115,18 @@ def test_a_budget_of_time_ends_all_shards(tmp_path, whole):
 
 def test_other_settings_overwrite_nothing(tmp_path, whole):
     run(tmp_path)
-    with pytest.raises(RapidError, match="shards differ"):
+    with pytest.raises(RapidError, match="shards: 3 there, 4 now"):
         run(tmp_path, shards=4)
-    with pytest.raises(RapidError, match="driver differ"):
+    with pytest.raises(RapidError, match=r"driver\.model"):
         collect_shards(partial(FakeTeacher, model="other"), SCENARIO, tmp_path, 150, shards=3, make_worlds=FakeWorlds)
-    with pytest.raises(RapidError, match="seeds, shard differ"):
+    with pytest.raises(RapidError, match="shards: 3 there, nothing now"):
         collect(FakeTeacher(), SCENARIO, tmp_path, 150, make_worlds=FakeWorlds)
     with pytest.raises(RapidError, match="1 to 1000 shards"):
         run(tmp_path, shards=0)
     run(tmp_path)
     assert content(tmp_path) == whole
     collect(FakeTeacher(), SCENARIO, tmp_path / "plain", 50, make_worlds=FakeWorlds)
-    with pytest.raises(RapidError, match="shards differ"):
+    with pytest.raises(RapidError, match="shards"):
         run(tmp_path / "plain")
 
 
@@ -174,7 +174,7 @@ def test_a_cluster_of_ray_collects_the_same_bytes(tmp_path, whole, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "wrong", fail_after=3)
         (tmp_path / "wrong" / "collecting" / "shard-0002-of-0003").write_text("in the way")
-        with pytest.raises(RapidError, match="Cannot collect in"):
+        with pytest.raises(RapidError, match="Cannot write in"):
             run(tmp_path / "wrong", workers=2, engine="ray")
         with pytest.raises(RapidError, match=r"Ray lost a job.*No module named.*Every machine needs the same RAPID"):
             run(tmp_path / "unknown", workers=2, engine="ray", make_worlds=Unknown)

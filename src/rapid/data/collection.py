@@ -6,10 +6,10 @@ alone. The same command goes on wherever a process was ended, by any signal, and
 for byte, and the same log, apart from the seconds that its decisions took.
 """
 
+import contextlib
 import json
 import math
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 
 from rapid.data.dataset import DATASET_FILE, Dataset, load_dataset, save_dataset
-from rapid.data.driving import Budget, Collecting, MakeWorlds, SpentError, Tally
-from rapid.data.journal import check_settings, exclusive
+from rapid.data.driving import JOURNAL_FILE, Budget, Collecting, MakeWorlds, SpentError, Tally
+from rapid.data.journal import check_settings
+from rapid.data.parts import LIST_FILE
 from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
 from rapid.errors import RapidError
-from rapid.files import read_json, write_json, write_text
+from rapid.files import make_directory, read_json, remove_leftovers, write_json, write_text
+from rapid.locks import LOCK_FILE, exclusive
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.spawns import TrainPart, train_part
@@ -94,25 +96,22 @@ def collect(
         "shard": shard,
     }
     work = root / "collecting"
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RapidError(f"Cannot collect in '{root}': {error}. Choose a directory that you can write to.") from error
-    with exclusive(work / "lock"):
+    with exclusive(root):
+        make_directory(work)
         dataset = _resume(root, work, settings)
         target = None if transitions is None else math.ceil(transitions / parts)
         if dataset is not None:
             episodes = len(np.unique(dataset.transitions.episode_N))
             if episodes >= len(seeds) if target is None else len(dataset) >= target:
-                shutil.rmtree(work)
+                _remove(work)
                 if progress:
                     progress.skip(len(dataset))
                 return dataset
             _reopen(dataset, work)
-            write_json(work / "settings.json", settings)
+            write_json(work / "settings.json", settings, sealed=True)
             (root / DATASET_FILE).unlink()
-        run = Collecting(teacher, settings, work, budget or Budget(), progress, watch)
-        spent = run.collect_until(target, lockstep, seeds, make_worlds or _default_worlds(scenario))
+        run = Collecting(teacher, settings, seeds, work, budget or Budget(), progress, watch)
+        spent = run.collect_until(target, lockstep, make_worlds or _default_worlds(scenario))
         dataset = run.dataset(complete=not spent)
         if not len(dataset):
             raise SpentError(
@@ -121,7 +120,7 @@ def collect(
             )
         save_dataset(dataset, root)
         if not spent:
-            shutil.rmtree(work)
+            _remove(work)
         return dataset
 
 
@@ -139,25 +138,40 @@ def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
         before = (dataset.collection or {}).get("settings", {})
     elif (work / "settings.json").exists():
         before = read_json(work / "settings.json", "record of the collection")
-    elif (work / "journal.jsonl").exists() or any(work.glob("part-*")):
+    elif (work / JOURNAL_FILE).exists() or any(work.glob("part-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
     check_settings(root, before, settings)
     if dataset is None or not dataset.collection or not dataset.collection["complete"]:
         if dataset is not None and not (work / "settings.json").exists():
             _reopen(dataset, work)
-        write_json(work / "settings.json", settings)
+        write_json(work / "settings.json", settings, sealed=True)
         return None
     # A complete dataset is the truth; what lies beside it was left by a process that ended while cleaning up.
-    for path in work.glob("part-*"):
-        path.unlink()
-    (work / "journal.jsonl").unlink(missing_ok=True)
-    (work / MEMORY_FILE).unlink(missing_ok=True)
-    (work / "settings.json").unlink(missing_ok=True)
+    _clear(work)
     return dataset
+
+
+def _clear(work: Path) -> None:
+    """Remove what a collection keeps while it is under way."""
+    for pattern in ("part-*", "journal*.jsonl", LIST_FILE, MEMORY_FILE, "settings.json"):
+        for path in work.glob(pattern):
+            path.unlink()
+
+
+def _remove(work: Path) -> None:
+    """Remove the directory of a collection in progress, unless something is in it that is not ours."""
+    if not work.exists():
+        return
+    _clear(work)
+    (work / LOCK_FILE).unlink(missing_ok=True)  # where an earlier version had its lock
+    remove_leftovers(work)
+    with contextlib.suppress(OSError):
+        work.rmdir()
 
 
 def _reopen(dataset: Dataset, work: Path) -> None:
     """Make a part of a dataset, so that a collection can go on from it."""
+    _clear(work)
     table = to_table(dataset.transitions)
     if dataset.log is None:
         raise RapidError(f"The dataset beside '{work}' has no teacher log to go on from. Choose another directory.")

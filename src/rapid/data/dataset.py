@@ -82,7 +82,9 @@ def save_dataset(dataset: Dataset, directory: str | os.PathLike[str]) -> None:
     """
     root = Path(directory)
     dataset.transitions.validate("the dataset")
-    (root / DATASET_FILE).unlink(missing_ok=True)
+    # It vouches for the others, and goes first. Those that this dataset has not would be foreign to it.
+    for name in (DATASET_FILE, LOG_FILE, MEMORY_FILE):
+        (root / name).unlink(missing_ok=True)
     tables = {TRANSITIONS_FILE: to_table(dataset.transitions)}
     if dataset.log is not None:
         tables[LOG_FILE] = dataset.log
@@ -108,6 +110,7 @@ def save_dataset(dataset: Dataset, directory: str | os.PathLike[str]) -> None:
                 for name, count in rows.items()
             },
         },
+        sealed=True,
     )
 
 
@@ -128,20 +131,54 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
         )
     try:
         get_scenario(meta["scenario"])
-        for name, facts in meta["files"].items():
-            _check_file(root / name, facts)
+        _check_files(root, meta["files"])
         table = read_parquet(root / TRANSITIONS_FILE, "transitions")
         log = current_log(read_parquet(root / LOG_FILE, "teacher log")) if LOG_FILE in meta["files"] else None
         memory = read_experiences(root / MEMORY_FILE) if MEMORY_FILE in meta["files"] else None
         dataset = Dataset(
             meta["scenario"], from_table(table), meta["drivers"], log, meta["mixture"], meta["collection"], memory
         )
-    except (KeyError, TypeError, AttributeError) as error:
+        _check_kinds(dataset)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RapidError(
-            f"'{root / DATASET_FILE}' lacks {error}. It was edited or damaged; make the dataset again."
+            f"'{root / DATASET_FILE}' lacks what it should say: {error}. It was edited or damaged; make the dataset "
+            "again."
         ) from error
     dataset.transitions.validate(f"the dataset '{root}'")
+    if log is not None and log.num_rows != len(dataset):
+        raise RapidError(
+            f"The dataset '{root}' has {len(dataset)} transitions, but a log of {log.num_rows} decisions. They are not "
+            "of one collection; copy or make it again."
+        )
     return dataset
+
+
+def _check_kinds(dataset: Dataset) -> None:
+    """Raise TypeError or ValueError unless what ``dataset.json`` says has the form that its readers expect."""
+    for name, value in (("mixture", dataset.mixture), ("collection", dataset.collection)):
+        if value is not None and not isinstance(value, dict):
+            raise TypeError(f"'{name}' is {value!r}")
+    if not all(isinstance(driver, dict) for driver in dataset.drivers.values()):
+        raise TypeError("'drivers' does not describe each driver")
+    if type(dataset.known) is not int or not 0 <= dataset.known <= len(dataset.memory or ()):
+        raise ValueError("'drivers' has more experiences than the memory")
+    if dataset.teacher_share is not None and not 0 <= dataset.teacher_share <= 1:
+        raise ValueError(f"'mixture' has the share {dataset.teacher_share}")
+
+
+def _check_files(root: Path, listed: dict[str, Any]) -> None:
+    """Raise unless every file of the dataset is named with its size and hash, and has them."""
+    unnamed = [name for name in (LOG_FILE, MEMORY_FILE) if name not in listed and (root / name).exists()]
+    for name in (TRANSITIONS_FILE, *unnamed):
+        if name not in listed:
+            raise RapidError(
+                f"'{root / DATASET_FILE}' does not name the SHA-256 of '{name}', so nobody can tell whether that is "
+                "the file that was written. Copy the dataset again, as a whole."
+            )
+    for name, facts in listed.items():
+        if name not in (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE):
+            raise RapidError(f"'{root / DATASET_FILE}' names a file '{name}', which no dataset has. Copy it again.")
+        _check_file(root / name, facts)
 
 
 def _check_file(path: Path, facts: dict[str, Any]) -> None:

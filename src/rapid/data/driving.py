@@ -14,16 +14,8 @@ from rapid.data.dataset import Dataset
 from rapid.data.fallbacks import TooManyFallbacksError, check_share, is_fallback
 from rapid.data.hindsight import Hindsight
 from rapid.data.journal import Journal
-from rapid.data.tables import (
-    LOG_SCHEMA,
-    PART_SCHEMA,
-    TRANSITION_SCHEMA,
-    current_log,
-    from_table,
-    read_parquet,
-    to_table,
-    write_parquet,
-)
+from rapid.data.parts import Parts
+from rapid.data.tables import LOG_SCHEMA, PART_SCHEMA, TRANSITION_SCHEMA, from_table, to_table
 from rapid.data.transitions import SOURCES, TEACHER, Transitions
 from rapid.errors import RapidError
 from rapid.progress import Task
@@ -71,6 +63,9 @@ class Tally(NamedTuple):
         return f"{self.rate:.3g} decisions/s{cost}{invalid}"
 
 
+JOURNAL_FILE = "journal.jsonl"
+
+
 class SpentError(RapidError):
     """The budget is spent; the message says which."""
 
@@ -82,22 +77,21 @@ class Collecting:
         self,
         teacher: Teacher,
         settings: dict[str, Any],
+        seeds: Sequence[int],
         work: Path,
         budget: Budget,
         progress: Task | None,
         watch: Callable[[Tally], None] | None = None,
     ) -> None:
         self.teacher, self.settings, self.work, self.budget, self.progress = teacher, settings, work, budget, progress
-        self.watch = watch
+        self.watch, self.seeds = watch, seeds
         self.source = SOURCES.index(settings["source"])
-        paths = sorted(work.glob("part-*.parquet"))
-        self.parts = [current_log(read_parquet(path, "part of a collection")) for path in paths]
-        self.count = sum(part.num_rows for part in self.parts)
-        self.episodes = sum(len(part.column("episode").unique()) for part in self.parts)
+        self.parts = Parts(work, seeds)
+        self.count = sum(part.num_rows for part in self.parts.present)
         self.fresh, self.decisions = 0, self.count
         self.tokens = int(sum(self._sum(name) for name in ("tokens_in", "tokens_out")))
         self.cost = self._sum("cost")
-        self.fallbacks = sum(part.column("status").to_pylist().count("fallback") for part in self.parts)
+        self.fallbacks = sum(part.column("status").to_pylist().count("fallback") for part in self.parts.present)
         self.last_fallback: Decision | None = None
         self.hindsight, self.looked_back = Hindsight(work / MEMORY_FILE, teacher), 0
         for experience in self.hindsight.experiences:
@@ -106,54 +100,70 @@ class Collecting:
         if progress:
             progress.skip(self.count)
 
-    def collect_until(self, target: int | None, lockstep: int, seeds: Sequence[int], make_worlds: MakeWorlds) -> str:
+    def collect_until(self, target: int | None, lockstep: int, make_worlds: MakeWorlds) -> str:
         """Drive groups until there are `target` transitions, or from all seeds; return the budget spent, or nothing."""
-        duration = int(get_scenario(self.settings["scenario"]).config()["duration"])
-        worlds: Any = None
+        worlds = _Worlds(make_worlds)
         try:
+            # First those that were there once: what comes after is numbered, and looked back on, behind them.
+            for number in self.parts.missing:
+                self._collect_group(number, self.work / f"journal-{number:05d}.jsonl", worlds, self.parts.seeds(number))
             self._look_back()
-            while self.episodes < len(seeds) if target is None else self.count < target:
-                journal = Journal(self.work / "journal.jsonl", len(self.parts))
-                try:
-                    # The last groups are smaller, so that little more than the target is collected, and no group is
-                    # begun that the decisions left would not finish.
-                    wanted = lockstep
-                    if target is not None:
-                        wanted = min(wanted, math.ceil((target - self.count) / duration))
-                    if self.budget.decisions and journal.seeds is None:
-                        wanted = min(wanted, (self.budget.decisions - self.decisions) // duration)
-                        if wanted < 1:
-                            raise SpentError(f"The budget of {self.budget.decisions} decisions was spent")
-                    group = journal.seeds or list(seeds[self.episodes : self.episodes + wanted])
-                    if not group:
-                        raise RapidError(
-                            f"All {len(seeds)} spawn seeds are used, and {self.count} of {target} transitions are "
-                            "collected. Ask for fewer transitions, or give more seeds."
-                        )
-                    if journal.seeds is None:
-                        journal.begin(len(self.parts), group)
-                    if worlds is None or worlds.num_envs != len(group):
-                        if worlds is not None:
-                            worlds.close()
-                        worlds = make_worlds(len(group))
-                    part = self._drive(worlds, group, journal)
-                    write_parquet(part, self.work / f"part-{len(self.parts):05d}.parquet")
-                    journal.finish()
-                finally:
-                    journal.close()
-                self.parts.append(part)
-                self.count += part.num_rows
-                self.episodes += len(group)
+            while self.parts.episodes < len(self.seeds) if target is None else self.count < target:
+                self._collect_group(len(self.parts), self.work / JOURNAL_FILE, worlds, None, target, lockstep)
                 self._look_back()
         except SpentError as spent:
             return str(spent)
         finally:
-            if worlds is not None:
-                worlds.close()
+            worlds.close()
         return ""
 
-    def _drive(self, worlds: Any, seeds: list[int], journal: Journal) -> pa.Table:
-        """Drive one group of episodes to their ends, from the journal as far as it goes."""
+    def _collect_group(
+        self,
+        number: int,
+        path: Path,
+        worlds: "_Worlds",
+        seeds: list[int] | None,
+        target: int | None = None,
+        lockstep: int = 0,
+    ) -> None:
+        """Drive one group, of `seeds` or of those that come next, and keep it."""
+        journal = Journal(path, number)
+        try:
+            group = journal.seeds or seeds or self._next_group(target, lockstep)
+            if journal.seeds is None:
+                journal.begin(number, group)
+            part = self._drive(worlds.of(len(group)), group, journal, self.parts.first_episode(number))
+            self.parts.keep(number, group, part)
+            journal.finish()
+        finally:
+            journal.close()
+        self.count += part.num_rows
+
+    def _next_group(self, target: int | None, lockstep: int) -> list[int]:
+        """Return the seeds that come next.
+
+        The last groups are smaller, so that little more than the target is collected, and no group is begun that the
+        decisions left would not finish.
+        """
+        duration = int(get_scenario(self.settings["scenario"]).config()["duration"])
+        wanted = lockstep
+        if target is not None:
+            wanted = min(wanted, math.ceil((target - self.count) / duration))
+        if self.budget.decisions:
+            wanted = min(wanted, (self.budget.decisions - self.decisions) // duration)
+            if wanted < 1:
+                raise SpentError(f"The budget of {self.budget.decisions} decisions was spent")
+        first = self.parts.episodes
+        group = list(self.seeds[first : first + wanted])
+        if not group:
+            raise RapidError(
+                f"All {len(self.seeds)} spawn seeds are used, and {self.count} of {target} transitions are collected. "
+                "Ask for fewer transitions, or give more seeds."
+            )
+        return group
+
+    def _drive(self, worlds: Any, seeds: list[int], journal: Journal, first: int) -> pa.Table:
+        """Drive one group of episodes, which are numbered from `first` on, from the journal as far as it goes."""
         obs_BVF, _ = worlds.reset(seed=seeds)
         active = np.arange(len(seeds))
         previous: list[Decision | None] = [None] * len(seeds)
@@ -202,12 +212,13 @@ class Collecting:
             active = active[~(terminated_B | truncated_B)[active]]
             step += 1
             self._show(len(decisions))
-        return self._table(sorted(steps, key=lambda row: row["world"]), seeds)
+        return self._table(sorted(steps, key=lambda row: row["world"]), seeds, first)
 
     def _look_back(self) -> None:
         """Let a teacher that reflects learn from the finished episodes, once from each."""
         while self.looked_back < len(self.parts):
-            if episodes := self.hindsight.pending(self.parts[self.looked_back]):
+            part = self.parts.tables[self.looked_back]
+            if part is not None and (episodes := self.hindsight.pending(part)):
                 self._check_budget(0)
                 for experience in self.hindsight.look_back(episodes):
                     self._charge(experience)
@@ -217,7 +228,7 @@ class Collecting:
         self.tokens += experience.tokens_in + experience.tokens_out
         self.cost += experience.cost
 
-    def _table(self, steps: list[dict[str, Any]], seeds: list[int]) -> pa.Table:
+    def _table(self, steps: list[dict[str, Any]], seeds: list[int], first: int) -> pa.Table:
         """Return the steps of a group as a table of `PART_SCHEMA`."""
         said: list[Decision] = [row["decision"] for row in steps]
         world_N = np.array([row["world"] for row in steps])
@@ -230,7 +241,7 @@ class Collecting:
             terminated_N=np.array([row["terminated"] for row in steps], np.bool_),
             truncated_N=np.array([row["truncated"] for row in steps], np.bool_),
             source_N=np.full(len(steps), self.source, np.int8),
-            episode_N=self.episodes + world_N,
+            episode_N=first + world_N,
             step_N=np.array([row["step"] for row in steps], np.int64),
             spawn_seed_N=np.array(seeds, np.int64)[world_N],
             probabilities_NA=np.array([decision.probabilities or unknown for decision in said], np.float32),
@@ -243,7 +254,7 @@ class Collecting:
 
     def dataset(self, complete: bool) -> Dataset:
         """Return everything collected so far as a dataset."""
-        table = pa.concat_tables([PART_SCHEMA.empty_table(), *self.parts])
+        table = pa.concat_tables([PART_SCHEMA.empty_table(), *self.parts.leading])
         return Dataset(
             scenario=self.settings["scenario"],
             transitions=from_table(table),
@@ -254,7 +265,7 @@ class Collecting:
         )
 
     def _sum(self, name: str) -> float:
-        return float(sum(part.column(name).to_numpy().sum() for part in self.parts))
+        return float(sum(part.column(name).to_numpy().sum() for part in self.parts.present))
 
     def _count(self, decisions: Sequence[Decision]) -> None:
         """Add to the totals."""
@@ -285,3 +296,22 @@ class Collecting:
         if self.progress:
             self.progress.note(tally.note(self.source))
             self.progress.advance(count)
+
+
+class _Worlds:
+    """The vector environment, made anew when a group has another size."""
+
+    def __init__(self, make: MakeWorlds) -> None:
+        self._make, self._worlds = make, None
+
+    def of(self, count: int) -> Any:
+        """Return `count` worlds."""
+        if self._worlds is None or self._worlds.num_envs != count:
+            self.close()
+            self._worlds: Any = self._make(count)
+        return self._worlds
+
+    def close(self) -> None:
+        if self._worlds is not None:
+            self._worlds.close()
+        self._worlds = None

@@ -145,7 +145,8 @@ def export_d3rlpy(dataset: Dataset, path: str | os.PathLike[str], flatten: bool 
     """
     h5py = _need("h5py")
     runs = _runs(dataset.transitions)
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    # The file is locked by us already.
+    with atomic_path(path) as temporary, h5py.File(temporary, "w", locking=False) as file:
         file.create_dataset("columns", data=["observations", "actions", "rewards", "terminated"])
         file.create_dataset("num_episodes", data=len(runs))
         file.create_dataset("version", data="2.1")

@@ -1,6 +1,5 @@
 """What a teacher learns from the episodes of a collection, on disk as soon as it is known: nothing is asked twice."""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pyarrow as pa
 
 from rapid.data.tables import from_table
 from rapid.errors import RapidError
+from rapid.files import AppendedFile, truncate
 from rapid.teacher.decision import Decision, Teacher
 from rapid.teacher.experience import Experience, read_experience, to_lines
 from rapid.teacher.memory import Episode, Reflective
@@ -29,7 +29,7 @@ class Hindsight:
         content = path.read_bytes() if path.exists() else b""
         good = content[: content.rfind(b"\n") + 1]
         if len(good) < len(content):
-            os.truncate(path, len(good))
+            truncate(path, len(good))
         try:
             lines = good.decode().split("\n")[:-1]
         except UnicodeDecodeError as error:
@@ -69,11 +69,9 @@ class Hindsight:
         """Let the teacher look back, and give each experience once it is on the disk."""
         if self._teacher is None or not episodes:
             return
-        with self._path.open("ab", buffering=0) as stream:
+        with AppendedFile(self._path) as stream:
             for experience in self._teacher.look_back(episodes):
-                stream.write(to_lines([experience]).encode())
-                if experience.tokens_in:
-                    # As in the journal: sync what took long to get.
-                    os.fsync(stream.fileno())
+                # As in the journal: sync what took long to get.
+                stream.append(to_lines([experience]).encode(), sync=experience.tokens_in > 0)
                 self.experiences.append(experience)
                 yield experience

@@ -1,30 +1,29 @@
 """The journal of a collection: every decision is on disk before it acts, so that no answer is ever paid for twice."""
 
 import json
-import os
 import zlib
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid.config_io import differences
 from rapid.errors import RapidError
+from rapid.files import AppendedFile, truncate
+from rapid.progress import warn
 from rapid.teacher.decision import Decision, from_record, to_record
 
 _SYNC_AFTER_SECONDS = 0.1
+_CRC = "crc32"
 
 
 class Journal:
-    """The decisions of the group of episodes in progress, one JSON line a lockstep step.
+    """The decisions of the group of episodes in progress, one JSON line a lockstep step, each with its checksum.
 
-    The simulator is deterministic, so the decisions alone bring the group back to where it was. A last line that was
-    cut off is dropped.
-
-    Raises:
-        RapidError: a line other than the last cannot be read.
+    The simulator is deterministic, so the decisions alone bring the group back to where it was. From the first line on
+    that was cut off or damaged the file is dropped: those steps are decided anew.
     """
 
     def __init__(self, path: Path, group: int) -> None:
@@ -32,27 +31,21 @@ class Journal:
         self._lines: list[dict[str, Any]] = []
         content = path.read_bytes() if path.exists() else b""
         good = 0
-        for number, line in enumerate(content.splitlines(keepends=True), 1):
-            try:
-                if not line.endswith(b"\n"):
-                    break
-                record = json.loads(line)
-            except ValueError as error:
-                if good + len(line) == len(content):
-                    break
-                raise RapidError(
-                    f"Line {number} of '{path}' cannot be read: {error}. The file is damaged; delete it to decide the "
-                    "group of episodes in progress anew."
-                ) from error
+        for line in content.splitlines(keepends=True):
+            record = _read_line(line)
+            if record is None:
+                break
             self._lines.append(record)
             good += len(line)
+        if content[good:].count(b"\n") > content[good:].endswith(b"\n"):
+            warn(f"'{path}' is damaged after line {len(self._lines)}. The steps from there on are decided anew.")
         if self._lines and self._lines[0].get("group") != group:
             # The group was finished, and the process ended before it could remove its journal.
             self._lines, good = [], 0
         if good < len(content):
-            os.truncate(path, good)
+            truncate(path, good)
         self._next = 1
-        self._stream = path.open("ab", buffering=0)
+        self._stream = AppendedFile(path)
 
     @property
     def seeds(self) -> list[int] | None:
@@ -87,10 +80,8 @@ class Journal:
         record = {"seen": _checksum(obs_BVF), "decisions": [to_record(decision) for decision in decisions]}
         self._lines.append(record)
         self._next += 1
-        self._write(record)
         # What the system holds outlives the process; only a power cut could take it. Sync what took long to get.
-        if sum(decision.seconds for decision in decisions) > _SYNC_AFTER_SECONDS:
-            os.fsync(self._stream.fileno())
+        self._write(record, sync=sum(decision.seconds for decision in decisions) > _SYNC_AFTER_SECONDS)
 
     def forget_from(self, unwanted: Callable[[Decision], bool]) -> None:
         """Remove the first step with an unwanted decision and all steps after it: they are decided anew."""
@@ -108,7 +99,7 @@ class Journal:
     def _keep(self, count: int) -> None:
         """Remove all lines but the first `count`."""
         lines = self.path.read_bytes().splitlines(keepends=True)
-        os.truncate(self.path, sum(map(len, lines[:count])))
+        truncate(self.path, sum(map(len, lines[:count])))
         del self._lines[count:]
         self._next = min(self._next, count)
 
@@ -125,36 +116,36 @@ class Journal:
         self.close()
         self.path.unlink(missing_ok=True)
 
-    def _write(self, record: dict[str, Any]) -> None:
-        line = json.dumps(record, ensure_ascii=False, separators=(",", ":")) + "\n"
-        self._stream.write(line.encode())
+    def _write(self, record: dict[str, Any], sync: bool = False) -> None:
+        text = _to_text(record)
+        line = f'{text[:-1]},"{_CRC}":{zlib.crc32(_to_bytes(text))}}}\n'
+        self._stream.append(_to_bytes(line), sync)
+
+
+def _read_line(line: bytes) -> dict[str, Any] | None:
+    """Return what a line holds; None if it was cut off or is not what was written."""
+    try:
+        record = json.loads(line) if line.endswith(b"\n") else None
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(record, dict):
+        return None
+    # An earlier version wrote no checksums.
+    checksum = record.pop(_CRC, None)
+    return record if checksum is None or checksum == zlib.crc32(_to_bytes(_to_text(record))) else None
+
+
+def _to_text(record: dict[str, Any]) -> str:
+    return json.dumps(record, ensure_ascii=False, separators=(",", ":"))
+
+
+def _to_bytes(text: str) -> bytes:
+    # Half a pair of surrogates, which a server may send, is read back as it was.
+    return text.encode("utf-8", "surrogatepass")
 
 
 def _checksum(obs_BVF: NDArray[np.float32]) -> int:
     return zlib.crc32(np.ascontiguousarray(obs_BVF).tobytes())
-
-
-@contextmanager
-def exclusive(path: Path) -> Generator[None, None, None]:
-    """Hold a lock file, which the system releases when the process ends, however it ends.
-
-    Raises:
-        RapidError: another process holds it.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows has no such lock; two processes in one directory are the user's care there.
-        yield
-        return
-    with path.open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RapidError(
-                f"Another process is at work in '{path.parent}'. Wait for it, or give each its own directory and, to "
-                "collect, `--shard i/n`."
-            ) from error
-        yield
 
 
 def check_settings(root: Path, before: dict[str, Any] | None, settings: dict[str, Any]) -> None:
@@ -164,8 +155,7 @@ def check_settings(root: Path, before: dict[str, Any] | None, settings: dict[str
         RapidError: the settings differ; the message names them.
     """
     if before is not None and before != settings:
-        wrong = [name for name in settings if before.get(name) != settings[name]]
         raise RapidError(
-            f"'{root}' was collected with other settings: {', '.join(wrong)} differ. Choose another directory, or use "
-            "the same settings to go on."
+            f"'{root}' was collected with other settings: {differences(before, settings)}. Nothing was changed. Use "
+            "the same settings to go on, choose another directory, or replace what is there with --force."
         )

@@ -5,6 +5,7 @@ into the dataset, and ``collecting/`` goes. What is collected depends on the num
 when or where; the same command goes on after a kill, also with other workers or another engine.
 """
 
+import contextlib
 import math
 import shutil
 import time
@@ -19,11 +20,12 @@ import pyarrow as pa
 from rapid.data.collection import collect, identity
 from rapid.data.dataset import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE, Dataset, join, load_dataset, save_dataset
 from rapid.data.driving import Budget, MakeWorlds, SpentError, Tally
-from rapid.data.journal import check_settings, exclusive
+from rapid.data.journal import check_settings
 from rapid.data.transitions import SOURCES, concatenate
 from rapid.engines import Engine, Report, check_engine, run_jobs
 from rapid.errors import RapidError
-from rapid.files import read_json, write_bytes, write_json
+from rapid.files import make_directory, read_json, write_bytes, write_json
+from rapid.locks import LOCK_FILE, exclusive
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.spawns import TrainPart, train_part
@@ -85,26 +87,21 @@ def collect_shards(
     # Made here first: a teacher that cannot be had is known before any worker starts, and its weights are fetched once.
     driver = identity(make_teacher())
     settings = {"scenario": get_scenario(scenario).name, "source": source, "driver": driver, "shards": shards}
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RapidError(f"Cannot collect in '{root}': {error}. Choose a directory that you can write to.") from error
-    with exclusive(work / "lock"):
+    with exclusive(root):
+        make_directory(work)
         before = load_dataset(root) if (root / DATASET_FILE).exists() else None
         _check_same(root, settings, before)
         if before is not None and (before.collection or {}).get("complete"):
             if len(before) >= transitions:
-                shutil.rmtree(work)
+                _remove(work)
                 if progress:
                     progress.skip(len(before))
                 return before
             # It is the truth; what lies beside it was left by a process that ended while cleaning up.
-            for path in work.glob("shard-*"):
-                shutil.rmtree(path)
-            (work / "settings.json").unlink(missing_ok=True)
+            _clear(work)
         if before is not None and not (work / "settings.json").exists():
             _split(before, work)
-        write_json(work / "settings.json", settings)
+        write_json(work / "settings.json", settings, sealed=True)
         if before is not None and (before.collection or {}).get("complete"):
             (root / DATASET_FILE).unlink()
         now = time.time()
@@ -135,8 +132,23 @@ def collect_shards(
         dataset = replace(joined, collection={"complete": unspent, "settings": settings, **(joined.collection or {})})
         save_dataset(dataset, root)
         if unspent:
-            shutil.rmtree(work)
+            _remove(work)
         return dataset
+
+
+def _clear(work: Path) -> None:
+    """Remove what a collection keeps while it is under way."""
+    for path in work.glob("shard-*-of-*"):
+        shutil.rmtree(path)
+    (work / "settings.json").unlink(missing_ok=True)
+
+
+def _remove(work: Path) -> None:
+    """Remove the directory of a collection in progress, unless something is in it that is not ours."""
+    _clear(work)
+    (work / LOCK_FILE).unlink(missing_ok=True)  # where an earlier version had its lock
+    with contextlib.suppress(OSError):
+        work.rmdir()
 
 
 @dataclass(frozen=True)

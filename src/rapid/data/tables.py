@@ -6,16 +6,19 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from rapid.data.transitions import Transitions
-from rapid.errors import RapidError
+from rapid.errors import DamagedError, RapidError
 from rapid.files import atomic_path
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
 from rapid.teacher.decision import split_transcript
 
-_OBS = pa.list_(pa.float32(), NUM_VEHICLES * NUM_FEATURES)
+# Lists of any size, although all have the same: most readers (pyarrow before 26, fastparquet) cannot read a null among
+# lists of a fixed size.
+_FLOATS = pa.list_(pa.float32())
 
 TRANSITION_SCHEMA = pa.schema(
     [
@@ -27,13 +30,13 @@ TRANSITION_SCHEMA = pa.schema(
         pa.field("reward", pa.float32(), False),
         pa.field("terminated", pa.bool_(), False),
         pa.field("truncated", pa.bool_(), False),
-        pa.field("probabilities", pa.list_(pa.float32(), NUM_ACTIONS)),
-        pa.field("obs", _OBS),
-        pa.field("next_obs", _OBS),
+        pa.field("probabilities", _FLOATS),
+        pa.field("obs", _FLOATS),
+        pa.field("next_obs", _FLOATS),
     ]
 )
-"""One row a transition. `next_obs` is null where it is the `obs` of the next row, which halves the file;
-`probabilities` is null where the driver gave none."""
+"""One row a transition; an observation is a list of 15 x 5 numbers. `next_obs` is null where it is the `obs` of the next
+row, which halves the file; `probabilities` is null where the driver gave none."""
 
 LOG_SCHEMA = pa.schema(
     [
@@ -67,10 +70,14 @@ PART_SCHEMA = pa.schema(
 _KEYS = ("episode", "step", "spawn_seed", "source", "action", "reward", "terminated", "truncated")
 
 
-def _lists(rows: NDArray[Any], null_N: NDArray[np.bool_]) -> pa.FixedSizeListArray:
-    """Return the rows of a 2-D array as fixed-size lists, some of them null."""
-    flat = pa.array(np.ascontiguousarray(rows, np.float32).reshape(-1))
-    return pa.FixedSizeListArray.from_arrays(flat, rows.shape[1], mask=pa.array(null_N))
+def _lists(rows: NDArray[Any], null_N: NDArray[np.bool_]) -> pa.ListArray:
+    """Return the rows of a 2-D array as lists, some of them null."""
+    count, width = rows.shape
+    kept = np.ascontiguousarray(rows[~null_N], np.float32)
+    ends = np.concatenate([[0], np.cumsum(~null_N) * width]).astype(np.int32)
+    # A null list is told by a null in the place where it begins.
+    begins = pa.array(ends, mask=np.append(null_N, False))
+    return pa.ListArray.from_arrays(begins, pa.array(kept.reshape(-1))) if count else pa.array([], _FLOATS)
 
 
 def to_table(transitions: Transitions) -> pa.Table:
@@ -91,12 +98,20 @@ def to_table(transitions: Transitions) -> pa.Table:
 
 
 def _rows(column: pa.ChunkedArray, width: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return a column of fixed-size lists as an array N x `width`, and where it is null."""
+    """Return a column of lists as an array N x `width`, and where it is null.
+
+    Raises:
+        ValueError: a list has another length, or holds something else than numbers.
+    """
     array = column.combine_chunks() if column.num_chunks != 1 else column.chunk(0)
     null_N = np.asarray(array.is_null())
     rows = np.full((len(array), width), np.nan, np.float32)
     # flatten() leaves the null rows out.
-    rows[~null_N] = np.asarray(array.flatten()).reshape(-1, width)
+    values = np.asarray(array.flatten().cast(pa.float32()))
+    lengths = np.asarray(pc.list_value_length(array).drop_null())
+    if (lengths != width).any():
+        raise ValueError(f"a list has {int(lengths[lengths != width][0])} numbers instead of {width}")
+    rows[~null_N] = values.reshape(-1, width)
     return rows, null_N
 
 
@@ -107,20 +122,21 @@ def from_table(table: pa.Table) -> Transitions:
         RapidError: a column is missing or has another type.
     """
     try:
-        table = table.select(TRANSITION_SCHEMA.names).cast(TRANSITION_SCHEMA)
-    except (KeyError, pa.ArrowInvalid, pa.ArrowNotImplementedError, ValueError) as error:
+        table = table.select(TRANSITION_SCHEMA.names)
+        keys = table.select(_KEYS).cast(pa.schema([TRANSITION_SCHEMA.field(name) for name in _KEYS]))
+        columns = {name: keys.column(name).to_numpy() for name in _KEYS}
+        obs, _ = _rows(table.column("obs"), NUM_VEHICLES * NUM_FEATURES)
+        next_obs, repeated_N = _rows(table.column("next_obs"), NUM_VEHICLES * NUM_FEATURES)
+        probabilities, _ = _rows(table.column("probabilities"), NUM_ACTIONS)
+    except (KeyError, AttributeError, pa.ArrowException, TypeError, ValueError) as error:
         raise RapidError(
             f"The transitions have other columns than expected: {error}. Collect or convert them again."
         ) from error
     count = table.num_rows
-    columns = {name: table.column(name).to_numpy() for name in _KEYS}
-    obs, _ = _rows(table.column("obs"), NUM_VEHICLES * NUM_FEATURES)
-    next_obs, repeated_N = _rows(table.column("next_obs"), NUM_VEHICLES * NUM_FEATURES)
     if count and repeated_N[-1]:
         raise RapidError("The last transition has no next observation: the file has lost its end. Collect it again.")
     index = np.flatnonzero(repeated_N)
     next_obs[index] = obs[index + 1]
-    probabilities, _ = _rows(table.column("probabilities"), NUM_ACTIONS)
     shape = (count, NUM_VEHICLES, NUM_FEATURES)
     return Transitions(
         obs_NVF=obs.reshape(shape),
@@ -187,6 +203,8 @@ def write_parquet(table: pa.Table, path: str | os.PathLike[str]) -> None:
             temporary,
             compression="zstd",
             compression_level=9,
+            # So that a reader notices what changes on the disk later.
+            write_page_checksum=True,
             # Bytes of equal significance side by side compress far better than whole floats.
             use_byte_stream_split=split,  # pyright: ignore[reportArgumentType]
             use_dictionary=strings,  # pyright: ignore[reportArgumentType]
@@ -194,16 +212,26 @@ def write_parquet(table: pa.Table, path: str | os.PathLike[str]) -> None:
 
 
 def read_parquet(path: str | os.PathLike[str], what: str) -> pa.Table:
-    """Read a Parquet file.
+    """Read a Parquet file, and check the checksums of its pages if it has any.
 
     Raises:
-        RapidError: the file is missing or damaged; `what` names it.
+        DamagedError: the file is damaged; `what` names it.
+        RapidError: the file is missing.
     """
     try:
-        return pq.read_table(path)
+        return _in_lists(pq.read_table(path, page_checksum_verification=True))
     except FileNotFoundError as error:
         raise RapidError(f"There is no {what} at '{path}'. Check the path, or make it first.") from error
     except (OSError, pa.ArrowException) as error:
-        raise RapidError(
+        raise DamagedError(
             f"The {what} '{path}' cannot be read: {error}. The file is damaged or cut off; copy or make it again."
         ) from error
+
+
+def _in_lists(table: pa.Table) -> pa.Table:
+    """Return a table with lists of any size where an earlier version wrote lists of a fixed size."""
+    for place, field in enumerate(table.schema):
+        if pa.types.is_fixed_size_list(field.type) and pa.types.is_floating(field.type.value_type):
+            rows, null_N = _rows(table.column(field.name), field.type.list_size)
+            table = table.set_column(place, pa.field(field.name, _FLOATS), _lists(rows, null_N))
+    return table
