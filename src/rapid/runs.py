@@ -123,8 +123,8 @@ class RunDirectory:
         if changes:
             raise RapidError(
                 f"The run in '{self.path}' was made with other settings: {changes}. Nothing was changed. Repeat "
-                f"its own settings (rapid run --config {self.path / 'config.toml'} --directory {self.path}), or choose another "
-                "--directory."
+                f"its own settings (rapid run --config {self.path / 'config.toml'} --directory {self.path}), or choose "
+                "another --directory."
             )
 
     def is_done(self, step: str) -> bool:

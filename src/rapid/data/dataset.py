@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -135,10 +135,12 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
         table = read_parquet(root / TRANSITIONS_FILE, "transitions")
         log = current_log(read_parquet(root / LOG_FILE, "teacher log")) if LOG_FILE in meta["files"] else None
         memory = read_experiences(root / MEMORY_FILE) if MEMORY_FILE in meta["files"] else None
+        _check_kinds(meta)
         dataset = Dataset(
             meta["scenario"], from_table(table), meta["drivers"], log, meta["mixture"], meta["collection"], memory
         )
-        _check_kinds(dataset)
+        if memory is not None and not (type(dataset.known) is int and 0 <= dataset.known <= len(memory)):
+            raise ValueError("'drivers' tells of more experiences than there are")
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RapidError(
             f"'{root / DATASET_FILE}' lacks what it should say: {error}. It was edited or damaged; make the dataset "
@@ -153,17 +155,16 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
     return dataset
 
 
-def _check_kinds(dataset: Dataset) -> None:
+def _check_kinds(meta: dict[str, Any]) -> None:
     """Raise TypeError or ValueError unless what ``dataset.json`` says has the form that its readers expect."""
-    for name, value in (("mixture", dataset.mixture), ("collection", dataset.collection)):
-        if value is not None and not isinstance(value, dict):
-            raise TypeError(f"'{name}' is {value!r}")
-    if not all(isinstance(driver, dict) for driver in dataset.drivers.values()):
+    for name in ("mixture", "collection"):
+        if meta[name] is not None and not isinstance(meta[name], dict):
+            raise TypeError(f"'{name}' is {meta[name]!r}")
+    if not all(isinstance(driver, dict) for driver in meta["drivers"].values()):
         raise TypeError("'drivers' does not describe each driver")
-    if type(dataset.known) is not int or not 0 <= dataset.known <= len(dataset.memory or ()):
-        raise ValueError("'drivers' has more experiences than the memory")
-    if dataset.teacher_share is not None and not 0 <= dataset.teacher_share <= 1:
-        raise ValueError(f"'mixture' has the share {dataset.teacher_share}")
+    mixture: dict[str, Any] = meta["mixture"] or {"p": 0, "level": "transition"}
+    if not 0 <= mixture["p"] <= 1 or mixture["level"] not in get_args(MixLevel):
+        raise ValueError(f"'mixture' has the share {mixture['p']!r} and the level {mixture['level']!r}")
 
 
 def _check_files(root: Path, listed: dict[str, Any]) -> None:

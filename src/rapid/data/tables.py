@@ -35,8 +35,8 @@ TRANSITION_SCHEMA = pa.schema(
         pa.field("next_obs", _FLOATS),
     ]
 )
-"""One row a transition; an observation is a list of 15 x 5 numbers. `next_obs` is null where it is the `obs` of the next
-row, which halves the file; `probabilities` is null where the driver gave none."""
+"""One row a transition; an observation is a list of 15 x 5 numbers. `next_obs` is null where it is the `obs` of the
+next row, which halves the file; `probabilities` is null where the driver gave none."""
 
 LOG_SCHEMA = pa.schema(
     [
@@ -108,7 +108,7 @@ def _rows(column: pa.ChunkedArray, width: int) -> tuple[NDArray[np.float32], NDA
     rows = np.full((len(array), width), np.nan, np.float32)
     # flatten() leaves the null rows out.
     values = np.asarray(array.flatten().cast(pa.float32()))
-    lengths = np.asarray(pc.list_value_length(array).drop_null())
+    lengths = np.asarray(pc.call_function("list_value_length", [array]).drop_null())
     if (lengths != width).any():
         raise ValueError(f"a list has {int(lengths[lengths != width][0])} numbers instead of {width}")
     rows[~null_N] = values.reshape(-1, width)
