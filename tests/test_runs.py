@@ -42,7 +42,7 @@ def test_where_it_runs_may_change_and_settings_may_be_added(tmp_path: Path):
     config = preset("strong", "tiny")
     RunDirectory(tmp_path, config, STEPS)
     RunDirectory(tmp_path, replace(config, collect=replace(config.collect, workers=4)), STEPS)
-    manifest = json.loads((tmp_path / "run.json").read_text())
+    manifest = read_json(tmp_path / "run.json")
     for name in ("shards", "max_decisions"):
         del manifest["config"]["collect"][name]
     (tmp_path / "run.json").write_text(json.dumps(manifest))
@@ -55,7 +55,7 @@ def test_a_long_run_from_before_there_was_ppo_had_none(tmp_path: Path):
     config = preset("strong", "full", "ppo")
     without = replace(config, adapt=replace(config.adapt, ppo=PpoConfig()))
     RunDirectory(tmp_path, without, STEPS)
-    manifest = json.loads((tmp_path / "run.json").read_text())
+    manifest = read_json(tmp_path / "run.json")
     del manifest["config"]["adapt"]["ppo"]
     (tmp_path / "run.json").write_text(json.dumps(manifest))
     RunDirectory(tmp_path, without, STEPS)
@@ -98,3 +98,15 @@ def test_a_step_counts_only_with_all_before_it(tmp_path: Path):
     run.finish("collect", 1)
     run.finish("mix", 1)
     assert run.is_done("distill")
+
+
+@pytest.mark.parametrize("damage", ["{", "", "\0" * 80, '{"step": "mix", "seconds": 1'])
+def test_a_damaged_step_record_is_named_and_the_step_done_again(tmp_path: Path, capsys, damage: str):
+    run = RunDirectory(tmp_path, preset(), STEPS)
+    for step in STEPS:
+        run.finish(step, 1)
+    (tmp_path / "steps" / "mix.json").write_text(damage)
+    assert [run.is_done(step) for step in STEPS] == [True, False, False]
+    assert "mix.json' is damaged" in capsys.readouterr().err
+    run.finish("mix", 2)
+    assert all(run.is_done(step) for step in STEPS)
