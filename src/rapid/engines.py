@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from functools import partial
 from multiprocessing.connection import Connection, wait
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Generic, Literal, TypeVar, get_args
 
 import rapid
 from rapid.errors import RapidError, did_you_mean
@@ -40,6 +40,8 @@ def run_jobs(
     engine: Engine = "local",
     workers: int = 1,
     receive: Callable[[int, Any], None] | None = None,
+    more: Callable[[], Sequence[Argument]] | None = None,
+    lost: Callable[[int, str], Result] | None = None,
 ) -> Generator[tuple[int, Result], None, None]:
     """Run one job for each argument, at most `workers` at once, and yield (index, result) as they end.
 
@@ -52,19 +54,44 @@ def run_jobs(
         engine: where they run.
         workers: how many run at once.
         receive: is called with (index, report) in this process.
+        more: is asked for further arguments whenever a worker is free, and has none once all is done.
+        lost: gives the result of a job whose process was lost, and the others go on; None ends them all.
 
     Raises:
         RapidError: what a job raised, a job's process that was lost, or an engine that cannot be had.
     """
     check_engine(engine)
     hear = receive or (lambda index, report: None)
+    waiting = _Waiting(arguments, more)
     if engine == "ray":
-        yield from _on_ray(function, arguments, workers, hear)
+        yield from _on_ray(function, waiting, workers, hear, lost)
     elif workers == 1:
-        for index, argument in enumerate(arguments):
+        while waiting.fill():
+            index, argument = waiting.pop()
             yield index, function(argument, partial(hear, index))
     else:
-        yield from _in_processes(function, arguments, workers, hear)
+        yield from _in_processes(function, waiting, workers, hear, lost)
+
+
+class _Waiting(Generic[Argument]):
+    """Jobs that are waiting, and those that are still to come."""
+
+    def __init__(self, arguments: Sequence[Argument], more: Callable[[], Sequence[Argument]] | None) -> None:
+        self._waiting = deque(enumerate(arguments))
+        self._more = more
+        self.total = len(arguments)
+
+    def fill(self) -> bool:
+        """Ask for more if none is waiting; whether there is one now."""
+        if not self._waiting and self._more is not None:
+            for argument in self._more():
+                self._waiting.append((self.total, argument))
+                self.total += 1
+        return bool(self._waiting)
+
+    def pop(self) -> tuple[int, Argument]:
+        """Return the next job and its number."""
+        return self._waiting.popleft()
 
 
 def check_engine(engine: str) -> None:
@@ -84,18 +111,18 @@ def check_engine(engine: str) -> None:
 
 def _in_processes(
     function: Callable[[Argument, Report], Result],
-    arguments: Sequence[Argument],
+    waiting: _Waiting[Argument],
     workers: int,
     receive: Callable[[int, Any], None],
+    lost: Callable[[int, str], Result] | None,
 ) -> Generator[tuple[int, Result], None, None]:
     # Not an executor of the standard library: those cannot be told to end their processes.
     context = multiprocessing.get_context("spawn")
-    waiting = deque(enumerate(arguments))
     running: dict[Connection, tuple[int, Any]] = {}
     try:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                index, argument = waiting.popleft()
+        while waiting.fill() or running:
+            while len(running) < workers and waiting.fill():
+                index, argument = waiting.pop()
                 ours, theirs = context.Pipe(duplex=False)
                 process = context.Process(target=_serve, args=(theirs, function, argument), daemon=True)
                 process.start()
@@ -109,8 +136,13 @@ def _in_processes(
                     kind, value = connection.recv()
                 except EOFError:
                     process.join(_PATIENCE)
+                    if lost is not None:
+                        del running[connection]
+                        connection.close()
+                        yield index, lost(index, f"its process was ended from outside (exit code {process.exitcode})")
+                        continue
                     raise RapidError(
-                        f"The process of job {index + 1} of {len(arguments)} was ended from outside (exit code "
+                        f"The process of job {index + 1} of {waiting.total} was ended from outside (exit code "
                         f"{process.exitcode}); too little memory is the usual cause. What is done is kept: run the "
                         "same command again, perhaps with fewer workers."
                     ) from None
@@ -180,9 +212,10 @@ def _need_ray() -> Any:
 
 def _on_ray(
     function: Callable[[Argument, Report], Result],
-    arguments: Sequence[Argument],
+    waiting: _Waiting[Argument],
     workers: int,
     receive: Callable[[int, Any], None],
+    lost: Callable[[int, str], Result] | None,
 ) -> Generator[tuple[int, Result], None, None]:
     ray = _need_ray()
     started = not ray.is_initialized()
@@ -196,22 +229,29 @@ def _on_ray(
                 f"Ray cannot be reached or started: {error} Check RAY_ADDRESS and `ray status`, or use --engine local."
             ) from error
     # Named by their place in the list: what is kept of a task after it ended is no more than its result.
-    waiting = deque(enumerate(arguments))
     running: dict[Any, int] = {}
     reports: Any = None
     try:
         reports = ray.util.queue.Queue(actor_options={"num_cpus": 0})
         attempt = ray.remote(num_cpus=1, max_retries=_RETRIES)(_attempt)
-        while waiting or running:
-            while waiting and len(running) < workers:
-                index, argument = waiting.popleft()
+        while waiting.fill() or running:
+            while len(running) < workers and waiting.fill():
+                index, argument = waiting.pop()
                 report = partial(_put, reports, index)
                 running[attempt.remote(rapid.__version__, function, argument, report)] = index
             ended, _ = ray.wait(list(running), num_returns=1, timeout=_POLL)
             for index, report in reports.get_nowait_batch(reports.qsize()):
                 receive(index, report)
             for task in ended:
-                yield running.pop(task), _unpack(*ray.get(task))
+                index = running.pop(task)
+                try:
+                    content = ray.get(task)
+                except ray.exceptions.RayError as error:
+                    if lost is None:
+                        raise
+                    yield index, lost(index, f"Ray lost it: {type(error).__name__}")
+                    continue
+                yield index, _unpack(*content)
     except ray.exceptions.RayError as error:
         last = str(error).strip().splitlines()[-1:] or [type(error).__name__]
         raise RapidError(

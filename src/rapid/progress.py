@@ -1,15 +1,28 @@
 """Progress with an estimate of the time left: a live bar in a terminal, a plain line every few seconds elsewhere."""
 
+import io
 import sys
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 SECONDS_BETWEEN_LINES = 5.0
+_QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+@contextmanager
+def quiet() -> Generator[None, None, None]:
+    """Show nothing of the pieces of work in this block: somebody else tells how far the whole is."""
+    token = _QUIET.set(True)
+    try:
+        yield
+    finally:
+        _QUIET.reset(token)
 
 
 class Task:
@@ -67,7 +80,7 @@ class Task:
 @contextmanager
 def task(title: str, total: float, unit: str, stream: TextIO | None = None) -> Generator[Task, None, None]:
     """Show the progress of one piece of work while the block runs; the closing line is printed if it succeeds."""
-    out: TextIO = stream or sys.stderr
+    out: TextIO = io.StringIO() if _QUIET.get() else stream or sys.stderr
     if not out.isatty():
         work = Task(title, total, unit, out, None)
         yield work

@@ -1,0 +1,245 @@
+"""How each kind of cell is computed: from the directories of its inputs into its own, by the phases on disk."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import rapid
+from rapid.agents.open import open_agent
+from rapid.agents.saved import load_agent, save_agent
+from rapid.config import Config
+from rapid.data.dataset import load_dataset, mix, save_dataset
+from rapid.data.relabel import relabel
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import save_rows
+from rapid.evaluation.rollouts import evaluate_agent, is_applicable
+from rapid.experiments.cells import (
+    Adapt,
+    Cell,
+    Collect,
+    Data,
+    Decide,
+    Distill,
+    Drive,
+    Driver,
+    Fresh,
+    Mix,
+    Relabel,
+    Scenes,
+    Shipped,
+    data_scenario,
+    key,
+    kind_of,
+)
+from rapid.experiments.store import FACTS, ROWS
+from rapid.files import write_json
+from rapid.networks.q_network import build_network
+from rapid.phases.adapt import adapt_agent
+from rapid.phases.data import collect_transitions
+from rapid.phases.distill import distill_agent
+from rapid.runs import commit
+from rapid.scenarios import get_scenario
+from rapid.seeding import stream_seed
+from rapid.spawns import spawn_seeds
+from rapid.teacher import make_teacher
+
+SCENE = 15
+"""Decisions before a scene is looked at: the middle of an episode of 30."""
+
+
+def compute(cell: Cell, place: Path, given: Mapping[str, Path]) -> None:
+    """Compute a cell into `place`, reading its inputs' directories from `given`, by their keys.
+
+    A training goes on from the checkpoint that an earlier call left in `place`.
+
+    Raises:
+        RapidError: whatever keeps the work from its end.
+    """
+    match cell:
+        case Collect():
+            _collect(cell, place)
+        case Relabel():
+            save_dataset(relabel(load_dataset(_data(cell.data, given)), cell.reward), place / "data")
+        case Mix():
+            teacher, random = (load_dataset(_data(data, given)) for data in (cell.teacher, cell.random))
+            settings = cell.settings
+            mixed = mix(
+                teacher, random, settings.p, settings.size, stream_seed(cell.seed, "mix"), settings.level
+            )  # the stream that `rapid run` draws from
+            save_dataset(mixed, place / "data")
+        case Fresh():
+            seed = stream_seed(cell.seed, "network")
+            network = build_network(cell.network, get_scenario(cell.scenario).lanes, seed)
+            save_agent(place / "agent", network, {"name": "new weights", "scenario": cell.scenario, "seed": cell.seed})
+        case Distill():
+            distill_agent(_settings(cell), given[key(cell.data)] / "data", place)
+        case Adapt():
+            data = given[key(cell.data)] / "data" if cell.data else None
+            adapt_agent(_settings(cell), given[key(cell.origin)] / "agent", data, place)
+        case Drive():
+            _drive(cell, place, given)
+        case Scenes():
+            _scenes(cell, place, given)
+        case Decide():
+            _decide(cell, place, given)
+        case Shipped():
+            raise RapidError("A shipped dataset is there already.")
+
+
+def _settings(cell: Distill | Adapt) -> Config:
+    """Return the whole tree of settings of a training."""
+    base = Config(seed=cell.seed)
+    evaluate = replace(base.evaluate, curve_spawns=cell.curve_spawns)
+    if isinstance(cell, Distill):
+        scenario = data_scenario(cell.data)
+        mixture = cell.data.settings
+        return replace(
+            base, scenario=scenario, network=cell.network, distill=cell.settings, evaluate=evaluate, mix=mixture
+        )
+    adapt = replace(cell.settings, scenario=cell.scenario)
+    config = replace(base, scenario=cell.scenario, adapt=adapt, evaluate=evaluate)
+    origin: Any = cell.origin
+    while isinstance(origin, Adapt):
+        origin = origin.origin
+    config = replace(config, network=origin.network)
+    return replace(config, distill=origin.settings, mix=origin.data.settings) if isinstance(origin, Distill) else config
+
+
+def _data(data: Data, given: Mapping[str, Path]) -> Path:
+    if isinstance(data, Shipped):
+        return Path(f"shipped:{data.scenario}/{data.source}")
+    return given[key(data)] / "data"
+
+
+def _collect(cell: Collect, place: Path) -> None:
+    random = (cell.driver.backend, cell.driver.model) == ("scripted", "random")
+    collect = replace(Config().collect, teacher_transitions=cell.transitions, random_transitions=cell.transitions)
+    config = Config(scenario=cell.scenario, teacher=cell.driver, collect=collect, seed=cell.seed)
+    dataset = collect_transitions(config, place / "data", "random" if random else "teacher")
+    if len(dataset) < cell.transitions:
+        raise RapidError(f"Only {len(dataset)} of {cell.transitions} transitions were collected. Run it again.")
+
+
+def _agent(agent: Distill | Adapt | Driver, scenario: str, given: Mapping[str, Path], seed: int) -> Any:
+    if not isinstance(agent, Driver):
+        return load_agent(given[key(agent)] / "agent")
+    if agent.teacher is not None:
+        return make_teacher(agent.teacher, get_scenario(scenario).lanes, seed)
+    return open_agent(agent.name, scenario, seed)
+
+
+def _drive(cell: Drive, place: Path, given: Mapping[str, Path]) -> None:
+    agent = _agent(cell.agent, cell.scenario, given, cell.seed)
+    if not is_applicable(agent, cell.attack):
+        raise RapidError(f"The attack '{cell.attack}' cannot be made on '{agent.name}'.")
+    rows = evaluate_agent(
+        agent,
+        cell.scenario,
+        spawn_seeds(cell.spawn_set, cell.spawns),
+        (cell.attack,),
+        generator_seed=cell.seed,
+        training_seed=None if isinstance(cell.agent, Driver) else cell.agent.seed,
+        commit=commit(),
+    )
+    save_rows(place / ROWS, rows)
+
+
+def _scenes(cell: Scenes, place: Path, given: Mapping[str, Path]) -> None:
+    """The scenes are the middle of the first `count` test spawns' episodes, or the last before they end."""
+    agent = _agent(cell.agent, cell.scenario, given, cell.seed)
+    scenes: list[dict[str, Any]] = []
+    for seed in spawn_seeds("test", cell.count):
+        env = rapid.make_env(cell.scenario)
+        obs_VF, _ = env.reset(seed=seed)
+        for _ in range(SCENE):
+            obs_VF, _, terminated, truncated, _ = env.step(int(agent.act(np.asarray(obs_VF)[None])[0]))
+            if terminated or truncated:
+                break
+        env.close()
+        told = agent.explain(np.asarray(obs_VF)[None])
+        weights_VN = None if told.weights_BVN is None else told.weights_BVN[0].tolist()
+        scenes.append(
+            {
+                "seed": seed,
+                "obs": np.asarray(obs_VF).tolist(),
+                "weights": weights_VN,
+                "q": agent.q_values(np.asarray(obs_VF)[None])[0].tolist(),
+            }
+        )
+    gate = getattr(agent.network, "gate", None)
+    write_json(place / FACTS, {"scenes": scenes, "gate": None if gate is None else gate.detach().tolist()})
+
+
+def _decide(cell: Decide, place: Path, given: Mapping[str, Path]) -> None:
+    """One world at a time, as a car would ask; the first decision, which loads and compiles, is not counted."""
+    agent = _agent(cell.agent, cell.scenario, given, 0)
+    env = rapid.make_env(cell.scenario)
+    seconds: list[float] = []
+    previous: Any = None
+    seeds = iter(spawn_seeds("tune", cell.decisions + 1))
+    obs_VF, _ = env.reset(seed=next(seeds))
+    while len(seconds) <= cell.decisions:
+        start = time.perf_counter()
+        if hasattr(agent, "decide"):
+            decision = agent.decide(np.asarray(obs_VF)[None], [previous], np.array([len(seconds)], np.int64))[0]
+            action, previous = int(decision.action), decision
+        else:
+            action = int(agent.act(np.asarray(obs_VF)[None])[0])
+        seconds.append(time.perf_counter() - start)
+        obs_VF, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            previous = None
+            obs_VF, _ = env.reset(seed=next(seeds))
+    env.close()
+    count = len(seconds) - 1
+    write_json(
+        place / FACTS,
+        {
+            "agent": agent.name,
+            "decisions": count,
+            "median_seconds": float(np.median(seconds[1:])),
+            "mean_seconds": float(np.mean(seconds[1:])),
+            "threads": torch.get_num_threads(),
+        },
+    )
+
+
+def work_of(cell: Cell) -> tuple[str, float]:
+    """Return what a cell's time is counted in, and how many: for predictions.
+
+    Robust inner attacks and networks of tokens make a gradient step dearer, gradient attacks a driven episode.
+    """
+    match cell:
+        case Collect():
+            return f"collect/{cell.driver.backend}/{cell.driver.model}/{cell.driver.style}", cell.transitions
+        case Distill():
+            loss = cell.settings.loss
+            robust = f"{loss.robust_on}-{loss.robust.steps}" if loss.robust_weight else "none"
+            size = f"{cell.network.width}x{cell.network.layers}"
+            return f"distill/{cell.network.kind}/{size}/{robust}/{cell.settings.optimizer.batch_size}", float(
+                cell.settings.iterations
+            )
+        case Adapt():
+            settings = cell.settings
+            updates = settings.steps * settings.updates_per_step
+            return f"adapt/{_root_kind(cell)}/{'ppo' if settings.ppo.steps else 'q'}", settings.ppo.steps or max(
+                updates, 1.0
+            )
+        case Drive():
+            who = cell.agent.name if isinstance(cell.agent, Driver) else _root_kind(cell.agent)
+            return f"drive/{who}/{cell.attack.partition(':')[0]}", float(cell.spawns)
+        case Decide():
+            return f"decide/{cell.agent.name if isinstance(cell.agent, Driver) else 'policy'}", cell.decisions
+        case _:
+            return kind_of(cell), 1.0
+
+
+def _root_kind(agent: Distill | Adapt | Fresh) -> str:
+    while isinstance(agent, Adapt):
+        agent = agent.origin
+    return agent.network.kind

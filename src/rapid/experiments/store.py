@@ -1,0 +1,228 @@
+"""Where the results of cells lie: one directory a cell, and read-only layers of what is committed.
+
+A cell's directory ``KIND/KEY`` holds ``cell.json`` (what it is), its files, and last ``done.json`` (hashes, commit,
+versions, seconds): without it the cell is not done, and a training in it goes on from its checkpoint. A layer is a
+directory with the small results of many cells: ``*.parquet`` (episode rows with the key of their cell) and ``*.jsonl``
+(one line a cell: metrics, scenes or seconds).
+"""
+
+import json
+import shutil
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from rapid.data.journal import exclusive
+from rapid.data.tables import read_parquet
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
+from rapid.experiments.cells import Cell, Drive, describe, key, kind_of
+from rapid.files import read_json, sha256, write_json, write_text
+from rapid.runs import commit, versions
+from rapid.training.machinery.record import CHECKPOINT_FILE, load_metrics
+
+FORMAT = 1
+ROWS, FACTS, DONE = "rows.parquet", "facts.json", "done.json"
+
+
+class BusyError(Exception):
+    """Another process is at work on this cell."""
+
+
+class Store:
+    """The results of cells under `root`, and in `layers`, which are only read.
+
+    Raises:
+        RapidError: `root` holds something else, or a store of another format.
+    """
+
+    def __init__(self, root: Path, layers: Sequence[Path] = ()) -> None:
+        self.root, self.layers = root, tuple(layers)
+        marker = root / "store.json"
+        if marker.exists():
+            found = read_json(marker, "store of results")
+            if not isinstance(found, dict) or found.get("format") != FORMAT:
+                raise RapidError(
+                    f"'{root}' is a store of results of another version than {FORMAT}. Name another --store."
+                )
+        elif root.exists() and (not root.is_dir() or any(root.iterdir())):
+            raise RapidError(f"'{root}' exists and is no store of results. Name another --store, or an empty one.")
+        else:
+            write_json(marker, {"format": FORMAT})
+
+    def place(self, cell: Cell) -> Path:
+        """Return the cell's own directory, whether or not it is there."""
+        return self.root / kind_of(cell) / key(cell)
+
+    def is_done(self, cell: Cell) -> bool:
+        """Whether the cell's files are here, or its small results in a layer."""
+        return self.is_here(cell) or key(cell) in self._layered
+
+    def is_here(self, cell: Cell) -> bool:
+        """Whether the cell's own files are here."""
+        return (self.place(cell) / DONE).exists()
+
+    def provenance(self, cell: Cell) -> dict[str, Any]:
+        """Return who computed the cell: commit, versions, seconds; empty if it is not here."""
+        return read_json(self.place(cell) / DONE, "record of a cell") if self.is_here(cell) else {}
+
+    @contextmanager
+    def begin(self, cell: Cell) -> Generator[Path, None, None]:
+        """Hold the cell for this process and give its directory.
+
+        Raises:
+            BusyError: another process holds it.
+        """
+        place = self.place(cell)
+        place.mkdir(parents=True, exist_ok=True)
+        lock = exclusive(place / "lock")
+        try:
+            lock.__enter__()
+        except RapidError as error:
+            raise BusyError(str(error)) from None
+        try:
+            if not (place / "cell.json").exists():
+                write_json(place / "cell.json", describe(cell))
+            yield place
+        finally:
+            lock.__exit__(None, None, None)
+
+    def finish(self, cell: Cell, seconds: float) -> None:
+        """Mark a cell as done; what was only needed to resume goes."""
+        place = self.place(cell)
+        for path in place.rglob(CHECKPOINT_FILE):
+            path.unlink()
+        files = sorted(path for path in place.rglob("*") if path.is_file() and path.name not in (DONE, "lock"))
+        write_json(
+            place / DONE,
+            {
+                "cell": describe(cell),
+                "seconds": round(seconds, 3),
+                "commit": commit(),
+                "versions": versions(),
+                "files": {str(path.relative_to(place)): sha256(path) for path in files},
+            },
+        )
+
+    def check(self, cell: Cell) -> None:
+        """Raise RapidError if a file of a done cell is damaged or gone; the cell is then to be made again."""
+        place = self.place(cell)
+        for name, digest in self.provenance(cell)["files"].items():
+            if not (place / name).is_file() or sha256(place / name) != digest:
+                (place / DONE).unlink()
+                raise RapidError(f"'{place / name}' is damaged or gone. Run the same command again: it is made anew.")
+
+    def rows(self, cell: Drive) -> list[EpisodeRow]:
+        """Return the episodes of a driven cell.
+
+        Raises:
+            RapidError: they are not there, or damaged.
+        """
+        if self.is_here(cell):
+            return load_rows(self.place(cell) / ROWS)
+        found = self._layered.get(key(cell))
+        if not isinstance(found, list):
+            raise RapidError(f"The cell {key(cell)} has not been driven. Run `rapid reproduce` for it first.")
+        return found
+
+    def legacy(self, name: str) -> list[EpisodeRow]:
+        """Return committed rows from before there were cells, by the name that their migration gave them."""
+        found = self._layered.get(name, [])
+        return found if isinstance(found, list) else []
+
+    def metrics(self, cell: Cell) -> list[dict[str, Any]]:
+        """Return the metrics of a training, its second part after the first."""
+        if self.is_here(cell):
+            return _all_metrics(self.place(cell))
+        found = self._layered.get(key(cell))
+        return found["metrics"] if isinstance(found, dict) else []
+
+    def facts(self, cell: Cell) -> dict[str, Any]:
+        """Return the facts that a cell of another kind gives."""
+        if self.is_here(cell):
+            return read_json(self.place(cell) / FACTS, "facts of a cell")
+        found = self._layered.get(key(cell))
+        return found["facts"] if isinstance(found, dict) else {}
+
+    def pack(self, cell: Cell) -> dict[str, bytes]:
+        """Return the files of a done cell, for a machine that does not share this disk."""
+        self.check(cell)
+        place = self.place(cell)
+        return {name: (place / name).read_bytes() for name in self.provenance(cell)["files"]}
+
+    def export(self, cells: Iterable[Cell], folder: Path, name: str) -> list[Path]:
+        """Write the small results of done cells as a layer: ``NAME.parquet`` and ``NAME.jsonl``."""
+        tables: list[pa.Table] = []
+        lines: list[str] = []
+        for cell in sorted(set(cells), key=key):
+            if not self.is_done(cell):
+                continue
+            if isinstance(cell, Drive):
+                tables.append(_with_cell(self.rows(cell), cell, self.root))
+            elif metrics := self.metrics(cell) if kind_of(cell) in ("distill", "adapt") else []:
+                lines.append(json.dumps({"cell": key(cell), "spec": describe(cell), "metrics": metrics}))
+            elif kind_of(cell) in ("scenes", "decide"):
+                lines.append(json.dumps({"cell": key(cell), "spec": describe(cell), "facts": self.facts(cell)}))
+        written: list[Path] = []
+        if tables:
+            written.append(folder / f"{name}.parquet")
+            folder.mkdir(parents=True, exist_ok=True)
+            pq.write_table(pa.concat_tables(tables), written[-1], compression="zstd")
+        if lines:
+            written.append(folder / f"{name}.jsonl")
+            write_text(written[-1], "\n".join(lines) + "\n")
+        return written
+
+    @cached_property
+    def _layered(self) -> dict[str, list[EpisodeRow] | dict[str, Any]]:
+        """Small results in the layers, by the key of their cell; of two layers the first counts."""
+        found: dict[str, list[EpisodeRow] | dict[str, Any]] = {}
+        for layer in self.layers:
+            here: dict[str, Any] = {}
+            for path in sorted(layer.glob("*.parquet")):
+                names = read_parquet(path, "file of episode rows").column("cell").to_pylist()
+                for name, row in zip(names, load_rows(path), strict=True):
+                    here.setdefault(name, []).append(row)
+            for path in sorted(layer.glob("*.jsonl")):
+                for line in path.read_text(encoding="utf-8").splitlines():
+                    content = json.loads(line)
+                    here.setdefault(content["cell"], content)
+            found = here | found
+        return found
+
+
+def unpack(place: Path, files: dict[str, bytes]) -> None:
+    """Write packed files to a directory, whose earlier content goes."""
+    if place.exists():
+        shutil.rmtree(place)
+    for name, content in files.items():
+        path = place / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def files_of(place: Path) -> dict[str, bytes]:
+    """Return every file under a directory."""
+    return {
+        str(path.relative_to(place)): path.read_bytes()
+        for path in sorted(place.rglob("*"))
+        if path.is_file() and path.name not in ("lock", CHECKPOINT_FILE)
+    }
+
+
+def _all_metrics(place: Path) -> list[dict[str, Any]]:
+    folders = sorted({path.parent for path in place.rglob("metrics.jsonl")}, key=lambda path: len(path.parts))
+    return [row for folder in folders for row in load_metrics(folder)]
+
+
+def _with_cell(rows: Sequence[EpisodeRow], cell: Drive, scratch: Path) -> pa.Table:
+    path = scratch / "export.parquet"
+    save_rows(path, rows)
+    table = read_parquet(path, "file of episode rows")
+    path.unlink()
+    return table.append_column("cell", pa.array([key(cell)] * len(rows), pa.string()))
