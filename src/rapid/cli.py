@@ -21,6 +21,7 @@ VERBS: dict[str, str] = {
     "teach-bench": "compare teachers, models and prompt styles on the same spawns",
     "export": "write an agent as ONNX, check it against the original, time it",
     "report": "write the page of a run again",
+    "reproduce": "every table and figure of the paper, obtained beside printed",
     "presets": "print what a recipe, a scale and a plan set, or where two differ",
     "models": "list, fetch, verify and remove the embedded language models",
     "verify-simulator": "hold the compiled simulator against highway-env, step by step",

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import tyro
 from tyro.conf import Positional, arg
@@ -238,6 +238,37 @@ class Report:
 
 
 @dataclass(frozen=True)
+class Reproduce:
+    """Compute tables and figures of the paper and ours, beside what the paper prints; without an id list them.
+
+    The same command goes on after an interruption; what is done is never computed again.
+    """
+
+    ids: Annotated[Positional[tuple[str, ...]], arg(metavar="ID ...")] = ()
+    """Such as attack, offline or ratio; `all` is every one."""
+    recipe: Recipe = "paper"
+    """How things are trained."""
+    scale: Scale = Config.scale
+    """How much is run: tiny (minutes), quick, full (five trainings, 200 spawns)."""
+    engine: Annotated[str, arg(metavar="{local,ray}")] = CollectConfig.engine
+    """Where parts are computed."""
+    workers: Positive = 1
+    """Parts under way at once."""
+    store: str = "runs/store"
+    """Directory of finished parts."""
+    layers: tuple[str, ...] = ()
+    """Directories of small results that are only read; results/cells is one wherever it is there."""
+    out: str = ""
+    """Directory of the page; by default runs/reproduce/RECIPE-SCALE."""
+    export: str = ""
+    """Also write the small results to this directory, as a layer for other checkouts."""
+    dry_run: bool = False
+    """Only say what is done and what is to do."""
+    page_only: bool = False
+    """Compute nothing: write the page of what is there."""
+
+
+@dataclass(frozen=True)
 class Presets:
     """Print what a recipe, a scale and a plan set; with a second one, only where the two differ."""
 
@@ -346,7 +377,7 @@ def _defaults(kind: type[T], base: Config) -> T:
             values[item.name] = base
         elif item.name == "source":
             values[item.name] = Source(base.recipe, base.scale, base.plan)
-        elif hasattr(base, item.name):
+        elif hasattr(base, item.name) and item.default in (dataclasses.MISSING, getattr(Config, item.name, None)):
             values[item.name] = getattr(base, item.name)
         elif item.name == "curve_spawns":
             values[item.name] = base.evaluate.curve_spawns
@@ -529,6 +560,37 @@ def _report(options: Report, config: Config) -> int:
     return 0
 
 
+def _reproduce(options: Reproduce, config: Config) -> int:
+    from rapid.experiments.exhibits import ALL, cells_of
+    from rapid.experiments.reproduce import listing, open_reproduction, reproduce, text_of, write_page
+
+    ids = () if options.ids == ("all",) else options.ids
+    layers = [Path(layer) for layer in options.layers]
+    of = open_reproduction(ids, options.recipe, options.scale, Path(options.store), layers)
+    if not options.ids or options.dry_run:
+        print(listing(of))
+        return 0
+    out = Path(options.out or f"runs/reproduce/{options.recipe}-{options.scale}")
+    failed: dict[str, str] = {}
+    if options.page_only:
+        page = write_page(of, out)
+    else:
+        outcome, page = reproduce(of, out, cast(Any, options.engine), options.workers)
+        failed = outcome.failed
+    if options.export:
+        for exhibit in of.exhibits:
+            name = f"{exhibit.id}-{of.request(exhibit).recipe}-{options.scale}"
+            of.store.export(
+                cells_of(ALL[exhibit.id], of.request(exhibit).recipe, options.scale), Path(options.export), name
+            )
+    if ids:
+        print(text_of(of))
+    print(f"page: {page}")
+    if failed:
+        print(f"{len(failed)} parts failed; the same command tries them again.", file=sys.stderr)
+    return int(bool(failed))
+
+
 def _presets(options: Presets, config: Config) -> int:
     if not options.first:
         for recipe, plans in OF_RECIPE.items():
@@ -598,6 +660,7 @@ _VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "teach-bench": (TeachBench, _teach_bench),
     "export": (Export, _export),
     "report": (Report, _report),
+    "reproduce": (Reproduce, _reproduce),
     "presets": (Presets, _presets),
     "models": (Models, _models),
     "verify-simulator": (VerifySimulator, _verify),

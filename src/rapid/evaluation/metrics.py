@@ -113,7 +113,15 @@ def load_rows(path: str | os.PathLike[str]) -> list[EpisodeRow]:
     Raises:
         RapidError: the file is missing, damaged, or lacks a column.
     """
-    table = read_parquet(path, "file of episode rows")
+    return rows_of_table(read_parquet(path, "file of episode rows"), path)
+
+
+def rows_of_table(table: pa.Table, path: str | os.PathLike[str]) -> list[EpisodeRow]:
+    """Return the rows of a table that was read from `path`; columns besides those of :data:`SCHEMA` are left out.
+
+    Raises:
+        RapidError: it lacks a column.
+    """
     try:
         table = table.select(SCHEMA.names).cast(SCHEMA)
     except (KeyError, ValueError, pa.ArrowException) as error:

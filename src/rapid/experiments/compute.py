@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -144,9 +145,12 @@ def _drive(cell: Drive, place: Path, given: Mapping[str, Path]) -> None:
         (cell.attack,),
         generator_seed=cell.seed,
         training_seed=None if isinstance(cell.agent, Driver) else cell.agent.seed,
-        commit=commit(),
+        commit=_commit(),
     )
     save_rows(place / ROWS, rows)
+
+
+_commit = cache(commit)
 
 
 def _scenes(cell: Scenes, place: Path, given: Mapping[str, Path]) -> None:

@@ -10,18 +10,21 @@ import json
 import shutil
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from rapid.data.journal import exclusive
 from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
-from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
+from rapid.evaluation.metrics import EpisodeRow, load_rows, rows_of_table, save_rows
 from rapid.experiments.cells import Cell, Drive, describe, key, kind_of
+from rapid.experiments.migrate import Legacy, legacy_rows
 from rapid.files import read_json, sha256, write_json, write_text
 from rapid.runs import commit, versions
 from rapid.training.machinery.record import CHECKPOINT_FILE, load_metrics
@@ -35,14 +38,14 @@ class BusyError(Exception):
 
 
 class Store:
-    """The results of cells under `root`, and in `layers`, which are only read.
+    """The results of cells under `root`, and in `layers`, which are only read; `results` has rows of before cells.
 
     Raises:
         RapidError: `root` holds something else, or a store of another format.
     """
 
-    def __init__(self, root: Path, layers: Sequence[Path] = ()) -> None:
-        self.root, self.layers = root, tuple(layers)
+    def __init__(self, root: Path, layers: Sequence[Path] = (), results: Path | None = None) -> None:
+        self.root, self.layers, self._results = root, tuple(layers), results
         marker = root / "store.json"
         if marker.exists():
             found = read_json(marker, "store of results")
@@ -103,8 +106,7 @@ class Store:
             {
                 "cell": describe(cell),
                 "seconds": round(seconds, 3),
-                "commit": commit(),
-                "versions": versions(),
+                **_provenance(),
                 "files": {str(path.relative_to(place)): sha256(path) for path in files},
             },
         )
@@ -126,14 +128,13 @@ class Store:
         if self.is_here(cell):
             return load_rows(self.place(cell) / ROWS)
         found = self._layered.get(key(cell))
-        if not isinstance(found, list):
+        if not isinstance(found, Slice):
             raise RapidError(f"The cell {key(cell)} has not been driven. Run `rapid reproduce` for it first.")
-        return found
+        return rows_of_table(found.table.take(found.rows), found.path)
 
-    def legacy(self, name: str) -> list[EpisodeRow]:
-        """Return committed rows from before there were cells, by the name that their migration gave them."""
-        found = self._layered.get(name, [])
-        return found if isinstance(found, list) else []
+    def legacy(self, wanted: Legacy) -> list[EpisodeRow]:
+        """Return committed rows from before there were cells."""
+        return legacy_rows(self._results, wanted) if self._results else []
 
     def metrics(self, cell: Cell) -> list[dict[str, Any]]:
         """Return the metrics of a training, its second part after the first."""
@@ -179,21 +180,33 @@ class Store:
         return written
 
     @cached_property
-    def _layered(self) -> dict[str, list[EpisodeRow] | dict[str, Any]]:
-        """Small results in the layers, by the key of their cell; of two layers the first counts."""
-        found: dict[str, list[EpisodeRow] | dict[str, Any]] = {}
+    def _layered(self) -> dict[str, "Slice | dict[str, Any]"]:
+        """Small results in the layers, by the key of their cell; of two the first counts."""
+        found: dict[str, Slice | dict[str, Any]] = {}
         for layer in self.layers:
-            here: dict[str, Any] = {}
             for path in sorted(layer.glob("*.parquet")):
-                names = read_parquet(path, "file of episode rows").column("cell").to_pylist()
-                for name, row in zip(names, load_rows(path), strict=True):
-                    here.setdefault(name, []).append(row)
+                table = read_parquet(path, "file of episode rows")
+                if "cell" not in table.column_names:
+                    raise RapidError(f"'{path}' is no layer of results: its rows name no cell. Remove it from there.")
+                names = np.array(table.column("cell").to_pylist(), np.str_)
+                for name in np.unique(names):
+                    found.setdefault(str(name), Slice(path, table, np.flatnonzero(names == name)))
             for path in sorted(layer.glob("*.jsonl")):
-                for line in path.read_text(encoding="utf-8").splitlines():
-                    content = json.loads(line)
-                    here.setdefault(content["cell"], content)
-            found = here | found
+                for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+                    try:
+                        content = json.loads(line)
+                        found.setdefault(content["cell"], content)
+                    except (ValueError, KeyError, TypeError) as error:
+                        raise RapidError(f"Line {number} of '{path}' is damaged: {error}. Restore the file.") from error
         return found
+
+
+class Slice(NamedTuple):
+    """The rows of one cell in a file of a layer."""
+
+    path: Path
+    table: pa.Table
+    rows: NDArray[np.int64]
 
 
 def unpack(place: Path, files: dict[str, bytes]) -> None:
@@ -213,6 +226,12 @@ def files_of(place: Path) -> dict[str, bytes]:
         for path in sorted(place.rglob("*"))
         if path.is_file() and path.name not in ("lock", CHECKPOINT_FILE)
     }
+
+
+@cache
+def _provenance() -> dict[str, Any]:
+    """Who computes, asked for once a process."""
+    return {"commit": commit(), "versions": versions()}
 
 
 def _all_metrics(place: Path) -> list[dict[str, Any]]:

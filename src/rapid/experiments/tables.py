@@ -1,0 +1,222 @@
+"""Tables as data, and as text, Markdown, LaTeX and HTML: what is obtained stands beside what is printed.
+
+A verdict is given where at least five trainings were driven: `inside` where the paper's mean lies in our 95 % interval,
+`above` and `below` where the interval lies above or below it; else `insufficient`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from rapid.evaluation.metrics import EpisodeRow, column
+from rapid.evaluation.statistics import ENOUGH_SEEDS, Estimate, estimate
+from rapid.evaluation.summary import aligned
+from rapid.experiments.paper import PaperResult
+from rapid.report.markup import Markup, join, tag
+
+Verdict = Literal["inside", "above", "below", "insufficient", ""]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One cell of a table: our return, and the paper's."""
+
+    mean: Estimate | None = None
+    iqm: Estimate | None = None
+    crash: Estimate | None = None
+    printed: PaperResult | None = None
+    failed: str = ""
+    """Why there is nothing."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """How ours compares with the paper's; empty where one of them is missing."""
+        if self.mean is None or self.printed is None:
+            return ""
+        if self.mean.training_seeds < ENOUGH_SEEDS:
+            return "insufficient"
+        if self.mean.low > self.printed.mean:
+            return "above"
+        return "below" if self.mean.high < self.printed.mean else "inside"
+
+
+def entry(rows: Sequence[EpisodeRow], printed: PaperResult | None = None, failed: str = "") -> Entry:
+    """Return what episodes of one agent under one attack say."""
+    if not rows:
+        return Entry(printed=printed, failed=failed or "not driven")
+    spawns = [row.seed for row in rows]
+    seeds = [row.training_seed for row in rows]
+    returns, crashes = column(rows, "episode_return"), column(rows, "crashed")
+    return Entry(
+        estimate(returns, spawns, seeds),
+        estimate(returns, spawns, seeds, statistic="iqm"),
+        estimate(crashes, spawns, seeds),
+        printed,
+    )
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of entries under columns; the first cells of a row say what it is."""
+
+    id: str
+    caption: str
+    heads: tuple[str, ...]
+    """Names of the first cells."""
+    columns: tuple[str, ...]
+    rows: tuple[tuple[tuple[str, ...], tuple[Entry, ...]], ...]
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def complete(self) -> bool:
+        """Whether no entry is missing."""
+        return all(each.mean is not None for _, entries in self.rows for each in entries)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """A table of words: settings, seconds, prompts."""
+
+    id: str
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = field(default=())
+
+
+def ours(each: Entry) -> str:
+    """Return our mean with its interval, the IQM and the number of trainings or spawns."""
+    if each.mean is None:
+        return f"– ({each.failed})" if each.failed else "–"
+    mean = each.mean
+    span = "" if np.isnan(mean.low) else f" [{mean.low:.1f}, {mean.high:.1f}]"
+    middle = "" if each.iqm is None else f", IQM {each.iqm.value:.1f}"
+    crash = "" if each.crash is None else f", crash {each.crash.value:.2f}"
+    count = f"{mean.training_seeds}×{mean.spawns}" if mean.training_seeds else f"{mean.spawns}"
+    return f"{mean.value:.1f}{span}{middle}{crash} ({count})"
+
+
+def printed(each: Entry) -> str:
+    """Return what the paper prints."""
+    return "" if each.printed is None else f"{each.printed.mean:.2f} ± {each.printed.spread:.2f}"
+
+
+def _cells(each: Entry) -> str:
+    parts = [ours(each), printed(each), each.verdict]
+    return " | ".join(part for part in parts if part)
+
+
+def text(table: Table | Facts) -> str:
+    """Return a table for a terminal."""
+    if isinstance(table, Facts):
+        lines = [list(table.columns), *(list(row) for row in table.rows)]
+    else:
+        lines = [[*table.heads, *table.columns]]
+        lines += [[*names, *map(_cells, entries)] for names, entries in table.rows]
+    return "\n".join([table.caption, "", aligned(lines), *table.notes])
+
+
+def markdown(table: Table | Facts) -> str:
+    """Return a table as Markdown."""
+
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "·").replace("\n", "<br>") for cell in cells) + " |"
+
+    if isinstance(table, Facts):
+        heads, body = list(table.columns), [list(row) for row in table.rows]
+    else:
+        heads = [*table.heads, *table.columns]
+        body = [[*names, *map(_cells, entries)] for names, entries in table.rows]
+    rule = "|" + "---|" * len(heads)
+    notes = [f"\n{note}" for note in table.notes]
+    return "\n".join([f"**{table.caption}**", "", line(heads), rule, *map(line, body), *notes])
+
+
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "&": r"\&",
+        "%": r"\%",
+        "$": r"\$",
+        "#": r"\#",
+        "_": r"\_",
+        "{": r"\{",
+        "}": r"\}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "β": r"$\beta$",
+        "±": r"$\pm$",
+        "×": r"$\times$",
+        "∞": r"$\infty$",
+        "–": "--",
+    }
+)
+
+
+def latex(table: Table | Facts) -> str:
+    """Return a table as LaTeX, in the style of booktabs."""
+
+    def line(cells: Sequence[str]) -> str:
+        return " & ".join(cell.translate(_LATEX) for cell in cells) + r" \\"
+
+    if isinstance(table, Facts):
+        heads, body = list(table.columns), [list(row) for row in table.rows]
+    else:
+        heads = [*table.heads, *table.columns]
+        body = [[*names, *map(_cells, entries)] for names, entries in table.rows]
+    return "\n".join(
+        [
+            r"\begin{table}[t]",
+            r"\centering",
+            rf"\caption{{{table.caption.translate(_LATEX)}}}",
+            rf"\label{{table:{table.id}}}",
+            rf"\begin{{tabular}}{{{'l' * len(heads)}}}",
+            r"\toprule",
+            line(heads),
+            r"\midrule",
+            *map(line, body),
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+        ]
+    )
+
+
+_MARKS = {"inside": "≈", "above": "▲", "below": "▼", "insufficient": "?", "": ""}
+
+
+def html(table: Table | Facts) -> Markup:
+    """Return a table as HTML, everything in it escaped."""
+    if isinstance(table, Facts):
+        head = tag("tr", *(tag("th", name, scope="col") for name in table.columns))
+        body = [
+            tag("tr", *(tag("td", tag("pre", cell) if "\n" in cell else cell) for cell in row)) for row in table.rows
+        ]
+    else:
+        head = tag("tr", *(tag("th", name, scope="col") for name in (*table.heads, *table.columns)))
+        body = [
+            tag("tr", *(tag("th", name, scope="row") for name in names), *map(_html_entry, entries))
+            for names, entries in table.rows
+        ]
+    notes = [tag("p", note, class_="note") for note in table.notes]
+    return join([tag("div", tag("table", tag("thead", head), tag("tbody", *body)), class_="scroll"), *notes])
+
+
+def _html_entry(each: Entry) -> Markup:
+    if each.mean is None:
+        return tag("td", "–", tag("small", each.failed), class_="missing")
+    mean = each.mean
+    parts: list[Markup] = [tag("b", f"{mean.value:.1f}")]
+    if not np.isnan(mean.low):
+        parts.append(tag("small", f" [{mean.low:.1f}, {mean.high:.1f}]"))
+    if each.iqm is not None:
+        parts.append(tag("small", f"IQM {each.iqm.value:.1f}", class_="line"))
+    if each.crash is not None:
+        parts.append(tag("small", f"crash {each.crash.value:.2f}", class_="line"))
+    if each.printed is not None:
+        parts.append(tag("small", f"paper {printed(each)}", class_="line paper"))
+        word = each.verdict if each.verdict != "insufficient" else f"{mean.training_seeds} of {ENOUGH_SEEDS} seeds"
+        parts.append(tag("small", f"{_MARKS[each.verdict]} {word}", class_=f"line verdict {each.verdict}"))
+    return tag("td", *parts, title=mean.unit)

@@ -1,0 +1,151 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import EpisodeRow
+from rapid.experiments import tables
+from rapid.experiments.exhibits import ALL, Request
+from rapid.experiments.figures import Curve, Lines, Point, Router, save
+from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
+from rapid.experiments.paper import PaperResult
+from rapid.experiments.reproduce import open_reproduction, verdicts, write_page
+from rapid.experiments.store import Store
+from rapid.experiments.tables import Entry, Facts, Table, entry
+
+RESULTS = Path(__file__).parents[2] / "results"
+
+
+def rows(mean: float, seeds: int, spawns: int = 20) -> list[EpisodeRow]:
+    # Symmetric about the mean, so that the mean is exact.
+    offsets = np.linspace(-2, 2, spawns)
+    return [
+        EpisodeRow(
+            *("lane-3-density-2", "RAPID", spawn, "none", mean + float(offsets[spawn]), 30, False, 2.0, 60.0, 0, 9.0),
+            (0.0, 0.0, 0.0, 0.0, 1.0),
+            training_seed=seed,
+        )
+        for seed in range(seeds)
+        for spawn in range(spawns)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("mean", "seeds", "printed", "verdict"),
+    [
+        (20.0, 5, 20.0, "inside"),
+        (20.0, 5, 10.0, "above"),
+        (20.0, 5, 30.0, "below"),
+        (20.0, 4, 10.0, "insufficient"),
+    ],
+)
+def test_a_verdict_needs_five_trainings_and_an_interval(mean: float, seeds: int, printed: float, verdict: str):
+    assert entry(rows(mean, seeds), PaperResult(printed, 3.0)).verdict == verdict
+
+
+def test_no_numbers_of_the_paper_are_no_verdict():
+    assert entry(rows(20, 5)).verdict == ""
+    assert entry([], PaperResult(1, 1), "2 of 3 parts are missing").verdict == ""
+
+
+TABLE = Table(
+    "attack",
+    "Return & more | under attack",
+    ("scenario", "method"),
+    ("none", "pgd_50"),
+    ((("lane-3 <b>", "A|B"), (entry(rows(20.42, 5), PaperResult(20.42, 2.59)), Entry(failed="not driven"))),),
+    ("A note.",),
+)
+
+
+def test_tables_are_written_in_every_form_with_what_is_missing():
+    assert "20.42 ± 2.59" in tables.text(TABLE)
+    assert "inside" in tables.text(TABLE)
+    markdown = tables.markdown(TABLE).splitlines()
+    assert len({line.count("|") for line in markdown if line.startswith("|")}) == 1
+    latex = tables.latex(TABLE)
+    assert r"pgd\_50" in latex
+    assert r"Return \& more" in latex
+    html = tables.html(TABLE)
+    assert "<b>" not in html.split("lane-3 ")[1][:3]
+    assert "not driven" in html
+
+
+def test_the_page_says_in_words_what_reproduces():
+    table = replace(TABLE, rows=((("lane-3", "RAPID"), (entry(rows(20, 5), PaperResult(30, 1)), Entry())),))
+    (sentence,) = verdicts(ALL["attack"], [table])
+    assert "1 below" in sentence
+    assert "lane-3, RAPID, none" in sentence
+
+
+def test_figures_are_the_same_bytes_for_the_same_points(tmp_path: Path):
+    lines = Lines("x", "A figure.", (Curve("a $1", (Point(0, 1, 0, 2), Point(1, 2, math.nan, math.nan))),), "x", "y")
+    first = [path.read_bytes() for path in save(lines, tmp_path / "a")]
+    assert first == [path.read_bytes() for path in save(lines, tmp_path / "b")]
+    obs = [[1.0, 0.0, 4.0, 20.0, 0.0], [1.0, 30.0, 0.0, 20.0, 0.0], [0.0] * 5]
+    router = Router("r", "Scene.", obs, [[0.9, 0.1], [0.4, -0.6], [1.0, 0.0]], 3)
+    assert [row[0] for row in router.data().rows] == ["ego", "1"]
+    assert all(path.stat().st_size > 1000 for path in save(router, tmp_path))
+
+
+def test_curves_join_phases_and_trainings():
+    offline = [{"iteration": 10, "evaluation": {"return": 1.0}}, {"iteration": 20, "evaluation": {"return": 2.0}}]
+    online = [{"step": 5, "evaluation": {"return": 4.0}}, {"step": 7, "evaluation": None}]
+    better = [{"step": 5, "evaluation": {"return": 6.0}}]
+    curve = Curve.of_metrics("RAPID", [(offline, online), (offline, better)], 20)
+    assert curve.points == (Point(10, 1, 1, 1), Point(20, 2, 2, 2), Point(25, 5, 4, 6))
+
+
+@pytest.mark.parametrize(
+    ("recipe", "method", "scenario", "attack", "count"),
+    [
+        ("strong", "rapid-ppo", "lane-4-density-2.5", "pgd", 1000),
+        ("strong", "slower", "lane-5-density-3:progress", "none", 200),
+        ("paper", "rapid", "lane-3-density-2", "none", 1000),
+        # Presence was left alone there, which is not what the recipe says today.
+        ("paper", "rapid", "lane-3-density-2", "pgd", 0),
+        ("strong", "nobody", "lane-3-density-2", "none", 0),
+    ],
+)
+def test_committed_rows_keep_their_meaning(recipe: str, method: str, scenario: str, attack: str, count: int):
+    assert len(legacy_rows(RESULTS, Legacy(recipe, method, scenario, attack))) == count
+
+
+def test_an_unknown_label_in_the_committed_rows_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    (tmp_path / FILES["paper"][0]).write_bytes((RESULTS / FILES["paper"][0]).read_bytes())
+    monkeypatch.delitem(LABELS["paper"], "CQL")
+    with pytest.raises(RapidError, match="'CQL'"):
+        legacy_rows(tmp_path, Legacy("paper", "rapid", "lane-3-density-2", "none"))
+
+
+def test_a_page_of_nothing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    of = open_reproduction(("attack", "environment", "ratio"), "paper", "tiny", tmp_path / "store")
+    page = write_page(of, tmp_path / "page").read_text()
+    assert "parts are missing" in page
+    assert "KinematicsObservation" in page
+    assert (tmp_path / "page" / "tables" / "attack.tex").exists()
+    assert (tmp_path / "page" / "figures" / "ratio.svg").exists()
+
+
+def test_words_are_those_of_the_presets():
+    (facts,) = ALL["hyperparameters"].show(Request("paper", "full"), Store.__new__(Store), ALL["hyperparameters"])
+    assert isinstance(facts, Facts)
+    assert all(ours == paper for _, name, ours, paper in facts.rows if paper != "–" and name != "learning rate")
+
+
+@pytest.mark.parametrize(
+    ("ids", "recipe", "scale", "says"),
+    [
+        (("atack",), "paper", "tiny", "did you mean 'attack'"),
+        (("floors",), "paper", "tiny", "only strong"),
+        ((), "papper", "tiny", "did you mean 'paper'"),
+        ((), "paper", "long", "tiny, quick, full"),
+    ],
+)
+def test_what_does_not_exist_is_named(ids: tuple[str, ...], recipe: str, scale: str, says: str, tmp_path: Path):
+    with pytest.raises(RapidError, match=says):
+        open_reproduction(ids, recipe, scale, tmp_path / "store")
