@@ -107,6 +107,12 @@ def prompt(recipe: str, caption: str) -> list[Facts]:
     """Return the prefix prompt and one recorded interaction, as the paper shows them."""
     from rapid.teacher.exhibit import prompt_exhibit
 
-    prefix, turns = prompt_exhibit()
-    rows = [("prefix prompt", prefix), *((turn.role, turn.text) for turn in turns)]
-    return [Facts("prompt", caption, ("who", "says"), tuple(rows))]
+    shown = prompt_exhibit()
+    who = {"model": "the model", "tool": "a tool", "driver": "RAPID"}
+    rows = [
+        ("prefix prompt", f"{shown.prefix}\n\n{shown.scene}"),
+        *((who[turn.role], turn.text) for turn in shown.turns),
+        ("decision", f"{shown.action}: {shown.reason}"),
+    ]
+    note = f"{shown.model} in {shown.scenario}, spawn {shown.spawn_seed}, decision {shown.step + 1}."
+    return [Facts("prompt", caption, ("who", "says"), tuple(rows), (note,))]
