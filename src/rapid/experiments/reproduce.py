@@ -21,7 +21,7 @@ from rapid.experiments.store import Store
 from rapid.experiments.tables import Facts, Table
 from rapid.files import write_text
 from rapid.progress import format_seconds
-from rapid.report.markup import Markup, join, tag
+from rapid.pages.markup import Markup, join, tag
 from rapid.runs import commit, versions
 
 RESULTS = Path("results")

@@ -14,7 +14,7 @@ from rapid.evaluation.metrics import EpisodeRow, column
 from rapid.evaluation.statistics import ENOUGH_SEEDS, Estimate, estimate
 from rapid.evaluation.summary import aligned
 from rapid.experiments.paper import PaperResult
-from rapid.report.markup import Markup, join, tag
+from rapid.pages.markup import Markup, join, tag
 
 Verdict = Literal["inside", "above", "below", "insufficient", ""]
 
