@@ -20,8 +20,8 @@ from rapid.experiments.methods import EFFORTS
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Facts, Table
 from rapid.files import write_text
-from rapid.progress import format_seconds
 from rapid.pages.markup import Markup, join, tag
+from rapid.progress import format_seconds
 from rapid.runs import commit, versions
 
 RESULTS = Path("results")
