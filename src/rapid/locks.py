@@ -13,6 +13,12 @@ from rapid.errors import RapidError
 from rapid.files import make_directory, remove_leftovers
 
 LOCK_FILE = "lock"
+
+
+class BusyError(RapidError):
+    """Another process holds the lock."""
+
+
 _held: set[tuple[int, str]] = set()
 """What this process holds: thread and path. A verb that calls another's code locks the same directory twice."""
 
@@ -109,7 +115,7 @@ def _lock(path: Path, what: Path) -> int | None:
             os.close(handle)  # its owner has just removed it: take the new one
         except BlockingIOError as error:
             os.close(handle)
-            raise RapidError(
+            raise BusyError(
                 f"Another process is at work in '{what}'. Wait for it, or give each its own directory and, to "
                 "collect, `--shard i/n`."
             ) from error

@@ -3,6 +3,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,8 @@ from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.experiments import graph
 from rapid.experiments.cells import Cell, Distill, Drive, Driver, Mix, Shipped, key
 from rapid.experiments.graph import Job, Result, plan, run
-from rapid.experiments.store import DONE, ROWS, BusyError, Store
+from rapid.experiments.store import DONE, ROWS, Store
+from rapid.locks import BusyError
 
 MIX = Mix(Shipped("lane-3-density-2", "teacher"), Shipped("lane-3-density-2", "random"), MixConfig(), 0)
 AGENTS = [Distill(MIX, NetworkConfig(), DistillConfig(), seed) for seed in range(3)]
@@ -98,25 +100,34 @@ def test_a_damaged_input_is_named_and_made_again(tmp_path: Path, made: Path):
 
 
 def test_two_at_once_share_the_work_and_never_a_cell(tmp_path: Path, made: Path, monkeypatch: pytest.MonkeyPatch):
-    # A lock belongs to who opened the file, so two stores in one process meet as two processes do.
-    other, store = Store(tmp_path / "store"), Store(tmp_path / "store")
-    claim = other.begin(MIX)
-    place = claim.__enter__()
+    # A lock belongs to a thread, so two threads meet as two processes do.
+    store, held, end = Store(tmp_path / "store"), threading.Event(), threading.Event()
+
+    def other() -> None:
+        mine = Store(tmp_path / "store")
+        with mine.begin(MIX) as place:
+            held.set()
+            end.wait(60)
+            (place / "made").write_text("by the other")
+            mine.finish(MIX, 1.0)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    assert held.wait(60)
     with pytest.raises(BusyError), store.begin(MIX):
         pass
-    slept: list[float] = []
+    sleep, slept = graph.time.sleep, []
 
-    def ends(seconds: float) -> None:
-        slept.append(seconds)
+    def wait(seconds: float) -> None:
         if seconds != graph.POLL:  # somebody else's patience
-            return
-        (place / "made").write_text("by the other")
-        other.finish(MIX, 1.0)
-        claim.__exit__(None, None, None)
+            return sleep(seconds)
+        slept.append(seconds)
+        end.set()
+        return thread.join()
 
-    monkeypatch.setattr(graph.time, "sleep", ends)
+    monkeypatch.setattr(graph.time, "sleep", wait)
     assert not run(plan(DRIVES[:1], store).todo, store, say=lambda line: None).failed
-    assert slept.count(graph.POLL) == 1
+    assert slept == [graph.POLL]
     assert key(MIX) not in made.read_text()
     assert (store.place(MIX) / "made").read_text() == "by the other"
 

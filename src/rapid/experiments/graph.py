@@ -14,7 +14,8 @@ from rapid.engines import Engine, run_jobs
 from rapid.errors import RapidError
 from rapid.experiments.cells import Cell, Collect, Decide, Drive, Driver, Shipped, inputs, key, kind_of, title
 from rapid.experiments.compute import compute, work_of
-from rapid.experiments.store import BusyError, Store, files_of, unpack
+from rapid.experiments.store import Store, files_of, unpack
+from rapid.locks import BusyError
 from rapid.progress import quiet, task
 
 POLL = 2.0

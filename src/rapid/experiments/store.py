@@ -19,22 +19,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from rapid.data.journal import exclusive
 from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, rows_of_table, save_rows
 from rapid.experiments.cells import Cell, Drive, describe, key, kind_of
 from rapid.experiments.migrate import Legacy, legacy_rows
 from rapid.files import read_json, sha256, write_json, write_text
+from rapid.locks import exclusive
 from rapid.runs import commit, versions
 from rapid.training.machinery.record import CHECKPOINT_FILE, load_metrics
 
 FORMAT = 1
 ROWS, FACTS, DONE = "rows.parquet", "facts.json", "done.json"
-
-
-class BusyError(Exception):
-    """Another process is at work on this cell."""
 
 
 class Store:
@@ -79,21 +75,13 @@ class Store:
         """Hold the cell for this process and give its directory.
 
         Raises:
-            BusyError: another process holds it.
+            rapid.locks.BusyError: another process holds it.
         """
         place = self.place(cell)
-        place.mkdir(parents=True, exist_ok=True)
-        lock = exclusive(place / "lock")
-        try:
-            lock.__enter__()
-        except RapidError as error:
-            raise BusyError(str(error)) from None
-        try:
+        with exclusive(place):
             if not (place / "cell.json").exists():
                 write_json(place / "cell.json", describe(cell))
             yield place
-        finally:
-            lock.__exit__(None, None, None)
 
     def finish(self, cell: Cell, seconds: float) -> None:
         """Mark a cell as done; what was only needed to resume goes."""
