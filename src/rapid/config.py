@@ -160,6 +160,9 @@ class NetworkConfig:
     mirror: bool = False
     """Average the Q-values with those of the mirrored road, left and right swapped back, which takes twice the time.
     For the reward `progress`, on as many lanes as it was trained on: the paper's reward pays more on the right."""
+    memory: bool = False
+    """Give it a memory of what a car knows by itself: the time, its own speed and lanes, dead-reckoned from its own
+    actions, which no attack on observations moves. For networks of tokens that do not average with the mirror image."""
 
 
 @dataclass(frozen=True)
@@ -273,10 +276,20 @@ class PpoConfig:
     """lambda of generalised advantage estimation."""
     clip: AboveZero = 0.2
     """How far the probability of an action may move from what it was when it was taken, as a share."""
+    largest_kl: Amount = 0.0
+    """Once a minibatch finds that the policy has moved so far from the one that drove, what is left of the passes over
+    that rollout teaches the critic alone; 0 is no such limit."""
     crash_penalty: Amount = 2.0
     """What a crash costs more while learning than in the return. In the last second it costs next to nothing there."""
     progress_crash_penalty: Amount = 5.0
     """The same under the reward `progress`: where all speed is paid, 2 leaves more crashes than always-slower has."""
+    entropy: Amount = 0.0
+    """Weight of the policy's entropy, which is added to what is sought."""
+    exploration: ShareBelowOne = 0.0
+    """Share of the steps, at first, in which an action drawn by chance takes the place of the policy's; it falls to
+    zero until half the steps are done. What pays only after several steps in a row is found so."""
+    exploration_hold: Positive = 8
+    """Such an action is held for 1 to so many steps."""
     critic_steps: Count = 38_400
     """Of the steps, the first ones, in which the critic alone learns."""
     learning_rate: AboveZero = 3e-4
@@ -287,6 +300,35 @@ class PpoConfig:
     """The policy's gradients are clipped to this norm."""
     critic_max_grad_norm: AboveZero = 1.0
     """The critic's gradients are clipped to this norm."""
+
+
+@dataclass(frozen=True)
+class AdversaryConfig:
+    """Who lies to the policy while PPO learns (:mod:`rapid.training.machinery.adversary`); the critic has the truth.
+
+    Each episode is under one of the mixture's attacks, or under none; sizes are in features scaled to +-1.
+    """
+
+    gradient_share: Share = 0.0
+    """Share of the episodes under projected gradients. At each step half of them climb from a random point of the
+    ball, and half from the truth, with steps that just reach the ball's edge."""
+    targeted_share: Share = 0.5
+    """Of those, the share in which each step drives the policy towards an action drawn by chance; the others drive it
+    away from what it would do."""
+    noise_share: Share = 0.0
+    """Share of the episodes under uniform noise."""
+    radius: AboveZero = 0.1
+    """Of the gradient attacks' ball (L-infinity)."""
+    steps: Positive = 5
+    """Gradient steps."""
+    step_size: AboveZero = 0.04
+    """Length of a gradient step from a random point."""
+    noise: AboveZero = 0.2
+    """The noise lies within so much of the truth."""
+    begin: ShareBelowOne = 0.0
+    """Share of PPO's steps before the first attack, in which the policy learns what pays."""
+    ramp: Share = 0.0
+    """Share of PPO's steps after that over which radius and noise grow to their size."""
 
 
 @dataclass(frozen=True)
@@ -325,6 +367,8 @@ class AdaptConfig:
     what it was, for a network of tokens that masks absent rows and has no position learned for each."""
     mirror: bool = False
     """Set `network.mirror` from this phase on; without this an agent keeps what it has."""
+    memory: bool = False
+    """Set `network.memory` from PPO on; without this an agent keeps what it has."""
     evaluate_every: Count = 1_000
     """Environment steps between two evaluations; 0 is never."""
     loss: LossConfig = field(default_factory=lambda: LossConfig(conservative_weight=0.2, robust_weight=0.0, n_step=3))
@@ -334,6 +378,8 @@ class AdaptConfig:
     """The optimiser of this phase."""
     ppo: PpoConfig = field(default_factory=PpoConfig)
     """What follows the Q-learning."""
+    adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
+    """Under which attacks PPO drives."""
 
 
 @dataclass(frozen=True)

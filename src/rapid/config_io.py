@@ -136,6 +136,29 @@ def validate(config: Config) -> Config:
             network.width % network.heads == 0,
             f"a multiple of network.heads = {network.heads}",
         ),
+        ("network.memory", not network.memory, "false: offline data holds no memory, adapt.memory gives one"),
+        ("adapt.memory", not adapt.memory or adapt.ppo.steps > 0, "false where adapt.ppo.steps is 0"),
+        ("adapt.memory", not (adapt.memory and (adapt.mirror or network.mirror)), "false where the road is mirrored"),
+        (
+            "adapt.memory",
+            not adapt.memory or network.kind in ("rapid", "attentive"),
+            f"false for network.kind '{network.kind}', which has no tokens",
+        ),
+        (
+            "adapt.adversary.gradient_share",
+            adapt.adversary.gradient_share + adapt.adversary.noise_share <= 1,
+            f"at most 1 together with adapt.adversary.noise_share = {adapt.adversary.noise_share:g}",
+        ),
+        (
+            "adapt.adversary.gradient_share",
+            adapt.adversary.gradient_share == 0 or adapt.ppo.steps > 0,
+            "0 where adapt.ppo.steps is 0: Q-learning is not attacked",
+        ),
+        (
+            "adapt.adversary.noise_share",
+            adapt.adversary.noise_share == 0 or adapt.ppo.steps > 0,
+            "0 where adapt.ppo.steps is 0: Q-learning is not attacked",
+        ),
         ("evaluate.attacks", len(config.evaluate.attacks) >= 1, "at least one name, such as none"),
     ]
     for name, good, expected in checks:

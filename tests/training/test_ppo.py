@@ -10,16 +10,17 @@ from test_distill import DATA, Killed, lines, network, weights
 
 from fake_worlds import FakeWorlds
 from rapid.agents.saved import QAgent
-from rapid.config import AdaptConfig, PpoConfig
+from rapid.config import AdaptConfig, AdversaryConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
 from rapid.networks.q_network import set_phase
 from rapid.scenarios import FASTER
 from rapid.simulator import make_vec
 from rapid.training import adapt_by_ppo, ppo
+from rapid.training.collector import Collector, advantages
 from rapid.training.machinery.diagnostics import Forgetting
 from rapid.training.machinery.worlds import Drive
-from rapid.training.ppo import PpoLearner, advantages, without_clock
+from rapid.training.ppo import PpoLearner, without_clock
 
 SCENARIO = "lane-3-density-2"
 PPO = PpoConfig(steps=100, num_envs=3, rollout=8, epochs=2, batch_size=10, critic_steps=24)
@@ -54,6 +55,11 @@ def train(directory, config=CONFIG, kind="rapid", seed=3, net=None, make_worlds=
     torch.set_num_threads(1)
     net = network(kind) if net is None else net
     return adapt_by_ppo(net, config, SCENARIO, directory, seed, make_worlds=make_worlds, **options)
+
+
+def collect(learner, drive, config):
+    """One rollout, as it is at the end of a training."""
+    return Collector(drive, config, AdversaryConfig(), learner.network.scale_F, 0, "cpu").collect(learner)
 
 
 def test_advantages_are_those_counted_by_hand():
@@ -160,13 +166,14 @@ def test_only_the_critic_is_told_the_time():
     late_BVF = obs_BVF.clone()
     late_BVF[:, 0, 0] = 1.7
     blind, seeing = (PpoLearner(net, PPO, 1.0, sees_clock, 0, 4) for sees_clock in (False, True))
-    assert torch.equal(blind.log_probs(late_BVF), blind.log_probs(obs_BVF))
-    assert torch.equal(blind.log_probs(late_BVF), seeing.log_probs(without_clock(late_BVF)))
+    assert torch.equal(blind.as_seen(late_BVF), without_clock(late_BVF))
+    assert torch.equal(blind.as_seen(late_BVF), obs_BVF)
+    assert torch.equal(seeing.as_seen(late_BVF), late_BVF)
     assert not torch.equal(seeing.log_probs(late_BVF), seeing.log_probs(obs_BVF))
     assert not torch.equal(blind.values(late_BVF), blind.values(obs_BVF))
     # The policy that drives is that of the agent, whose greedy action is the likeliest.
     greedy_B = QAgent(net, "RAPID").act(obs_BVF.numpy())
-    np.testing.assert_array_equal(greedy_B, blind.log_probs(late_BVF).argmax(1))
+    np.testing.assert_array_equal(greedy_B, blind.log_probs(blind.as_seen(late_BVF)).argmax(1))
     assert late_BVF[0, 0, 0] == pytest.approx(1.7)
 
 
@@ -178,10 +185,10 @@ def test_the_clock_is_kept_from_the_policy_wherever_the_scenario_does(tmp_path, 
             told.append(obs_BVF[:, 0, 0])
             return super().values(obs_BVF)
 
-        def log_probs(self, obs_BVF):
+        def log_probs(self, seen_BVF, state_BS=None):
             handle = self.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][:, 0, 0]))
             try:
-                return super().log_probs(obs_BVF)
+                return super().log_probs(seen_BVF, state_BS)
             finally:
                 handle.remove()
 
@@ -214,7 +221,7 @@ def test_nothing_comes_after_the_time_limit():
     config = replace(PPO, rollout=8, num_envs=2)
     learner = PpoLearner(net, config, 1.0, False, 0, 4)
     drive = Drive(lambda count: PaidWorlds(count, True, duration=5), 2, 1)
-    rollout = ppo.collect(learner, drive, config, torch.Generator().manual_seed(0), "cpu")
+    rollout = collect(learner, drive, config)
     paid_TW = (rollout.action_N == FASTER).float().view(8, 2)
     # Both worlds end with their fifth step: its target is what it paid and no more.
     torch.testing.assert_close(rollout.return_N.view(8, 2)[4], paid_TW[4])
@@ -229,7 +236,7 @@ def test_a_crash_costs_more_in_learning_than_in_what_is_reported():
         config = replace(PPO, crash_penalty=penalty, rollout=30, trace=1.0)
         drive = Drive(worlds, 3, 1)
         learner = PpoLearner(net, config, 1.0, False, 0, 4)
-        rollout = ppo.collect(learner, drive, config, torch.Generator().manual_seed(0), "cpu")
+        rollout = collect(learner, drive, config)
         found.append((rollout, drive.means()))
     (plain, means), (dear, same) = found
     assert means == same

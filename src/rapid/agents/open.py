@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rapid
+from rapid.agents.saved import remembers
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import Kind
 from rapid.scenarios import get_scenario
@@ -31,6 +32,10 @@ class Driver(Protocol):
 
     def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
         """Return what there is to say about the choice just made, for each of `worlds`."""
+        ...
+
+    def memory(self, worlds: NDArray[np.int64], count: int) -> NDArray[np.float32] | None:
+        """Return the states of `worlds`, of `count` in all, before the next choice; None for who has no memory."""
         ...
 
 
@@ -116,10 +121,24 @@ class _AgentDriver:
 
     def __init__(self, agent: Any, everywhere: bool) -> None:
         self._agent, self._everywhere = agent, everywhere
+        self._state_BS: NDArray[np.float32] | None = None
+        self._before_BS: NDArray[np.float32] | None = None
+
+    def memory(self, worlds: NDArray[np.int64], count: int) -> NDArray[np.float32] | None:
+        if not remembers(self._agent):
+            return None
+        if self._state_BS is None:
+            self._state_BS = np.array(self._agent.start(count), np.float32)
+        return self._state_BS[worlds]
 
     def choose(
         self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64], seed_B: NDArray[np.int64], step: int
     ) -> NDArray[np.int64]:
+        if (state_BS := self.memory(worlds, len(seen_BVF))) is not None and self._state_BS is not None:
+            action_B = np.asarray(self._agent.act(seen_BVF[worlds], state_BS), np.int64)
+            self._before_BS = state_BS
+            self._state_BS[worlds] = self._agent.remember(state_BS, action_B)
+            return action_B
         if self._everywhere:
             return np.asarray(self._agent.act(seen_BVF), np.int64)[worlds]
         return np.asarray(self._agent.act(seen_BVF[worlds]), np.int64)
@@ -128,6 +147,8 @@ class _AgentDriver:
         values = getattr(self._agent, "q_values", None)
         if not callable(values):
             return [(None, "")] * len(worlds)
+        if self._before_BS is not None:
+            return [(q_A, "") for q_A in np.asarray(values(seen_BVF[worlds], self._before_BS), np.float32)]
         q_BA = np.asarray(values(seen_BVF if self._everywhere else seen_BVF[worlds]), np.float32)
         return [(q_A, "") for q_A in (q_BA[worlds] if self._everywhere else q_BA)]
 
@@ -139,6 +160,9 @@ class _TeacherDriver:
         self._teacher, self._seed = teacher, generator_seed
         self.previous: dict[int, Any] = {}
         """Each world's last decision."""
+
+    def memory(self, worlds: NDArray[np.int64], count: int) -> NDArray[np.float32] | None:
+        return None
 
     def choose(
         self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64], seed_B: NDArray[np.int64], step: int

@@ -16,6 +16,7 @@ from rapid.config import NetworkConfig
 from rapid.config_io import apply_overrides
 from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
+from rapid.networks.memory import initial_state, next_state
 from rapid.networks.q_network import Explanation, QNetwork, build_network
 from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
 
@@ -26,7 +27,10 @@ WEIGHTS_FILE = "weights.safetensors"
 
 
 class Agent(Protocol):
-    """Anything that chooses actions from observations; of other than 15 vehicles, if it has an int `vehicles`."""
+    """Anything that chooses actions from observations; of other than 15 vehicles, if it has an int `vehicles`.
+
+    One that remembers has `has_memory` true, and :class:`RememberingAgent` says how it is driven.
+    """
 
     @property
     def name(self) -> str:
@@ -38,8 +42,34 @@ class Agent(Protocol):
         ...
 
 
+class RememberingAgent(Protocol):
+    """An agent with a memory: a state (B, S) for each of B worlds, kept by whoever drives it.
+
+    The state begins with the episode and moves on with each action, whatever is seen.
+    """
+
+    has_memory: bool
+
+    def start(self, worlds: int) -> np.ndarray:
+        """Return the states (B, S), float32, with which episodes begin."""
+        ...
+
+    def act(self, obs_BVF: np.ndarray, state_BS: np.ndarray) -> np.ndarray:
+        """Return the actions (B,), int64, for raw observations and states."""
+        ...
+
+    def remember(self, state_BS: np.ndarray, action_B: np.ndarray) -> np.ndarray:
+        """Return the states (B, S) after these actions."""
+        ...
+
+
+def remembers(agent: Any) -> bool:
+    """Whether an agent has a memory and is driven as a :class:`RememberingAgent`."""
+    return bool(getattr(agent, "has_memory", False))
+
+
 class QAgent:
-    """Drives greedily by a Q-network.
+    """Drives greedily by a Q-network; one with a memory is a :class:`RememberingAgent`.
 
     Args:
         network: the network; it is used as it is, not copied.
@@ -65,30 +95,48 @@ class QAgent:
         """On roads with how many lanes left is as good as right to it; None where it tells them apart."""
         return self.network.lanes if self.network.config.mirror else None
 
-    def act(self, obs_BVF: np.ndarray) -> np.ndarray:
+    @property
+    def has_memory(self) -> bool:
+        """Whether `act` and `q_values` take a state beside the observations."""
+        return self.network.memory is not None
+
+    def start(self, worlds: int) -> np.ndarray:
+        """Return the states (B, S), float32, with which episodes begin."""
+        return initial_state(worlds, self.network.lanes)
+
+    def remember(self, state_BS: np.ndarray, action_B: np.ndarray) -> np.ndarray:
+        """Return the states (B, S) after these actions."""
+        return next_state(state_BS, action_B, self.network.lanes)
+
+    def act(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> np.ndarray:
         """Return the greedy actions (B,), int64.
 
         Raises:
-            RapidError: the observations have the wrong shape or are not finite.
+            RapidError: the observations have the wrong shape or are not finite, or a state is missing or too much.
         """
-        return self.q_values(obs_BVF).argmax(1)
+        return self.q_values(obs_BVF, state_BS).argmax(1)
 
     @torch.inference_mode()
-    def q_values(self, obs_BVF: np.ndarray) -> np.ndarray:
+    def q_values(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> np.ndarray:
         """Return the Q-values (B, A), float32.
 
         Raises:
-            RapidError: the observations have the wrong shape or are not finite.
+            RapidError: the observations have the wrong shape or are not finite, or a state is missing or too much.
         """
-        return self.network(self._tensor(obs_BVF)).cpu().numpy()
+        return self.network(self._tensor(obs_BVF), self._state(state_BS)).cpu().numpy()
 
-    def explain(self, obs_BVF: np.ndarray) -> Explanation:
+    def explain(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> Explanation:
         """Return the Q-values and the routing weights, gate and attention they rest on.
 
         Raises:
-            RapidError: the observations have the wrong shape or are not finite.
+            RapidError: the observations have the wrong shape or are not finite, or a state is missing or too much.
         """
-        return self.network.explain(self._tensor(obs_BVF))
+        return self.network.explain(self._tensor(obs_BVF), self._state(state_BS))
+
+    def _state(self, state_BS: np.ndarray | None) -> Tensor | None:
+        if state_BS is None:
+            return None
+        return torch.from_numpy(np.ascontiguousarray(state_BS, np.float32)).to(self.network.scale_F.device)
 
     def _tensor(self, obs_BVF: np.ndarray) -> Tensor:
         return torch.from_numpy(check_observations(obs_BVF, self.name, self.vehicles)).to(self.network.scale_F.device)

@@ -85,7 +85,7 @@ class Worlds:
         while alive_B.any():
             worlds = np.flatnonzero(alive_B)
             seen_BVF = obs_BVF[:, :vehicles].copy()
-            seen_BVF[worlds] = perturb(seen_BVF[worlds], worlds, env)
+            seen_BVF[worlds] = perturb(seen_BVF[worlds], worlds, env, driver.memory(worlds, len(alive_B)))
             began = time.perf_counter()
             chosen = driver.choose(seen_BVF, worlds, self.seed_B, step)
             self.decision_seconds += time.perf_counter() - began

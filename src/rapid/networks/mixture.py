@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from rapid.config import NetworkConfig
 from rapid.networks.blocks import Transformer
 from rapid.networks.encoding import num_inputs
+from rapid.networks.memory import Recalled
 
 
 class PolicyEncoder(nn.Module):
@@ -31,9 +32,13 @@ class PolicyEncoder(nn.Module):
             self.position = None
         self.transformer = Transformer(config.layers, config.width, config.heads, config.feedforward)
 
-    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
-        """Return the policy's tokens (B, V, D)."""
+    def forward(
+        self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None
+    ) -> Tensor:
+        """Return the policy's tokens (B, V, D); what is recalled is added to each."""
         tokens_BVD = self.projection(features_BVF)
+        if recalled_BD is not None:
+            tokens_BVD = tokens_BVD + recalled_BD[:, None]
         if self.position is not None:
             rows = self.position.shape[0]
             # A mark on the ego alone is one row, filled up with zeros.
@@ -61,24 +66,29 @@ class MixtureOfPolicies(nn.Module):
         self.stays_closed = False
         """Whether the gate is 0 and is not trained. A recording on a GPU, which cannot look, goes by it."""
 
-    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
-        """Return the mixed tokens (B, V, D)."""
+    def forward(
+        self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None
+    ) -> Tensor:
+        """Return the mixed tokens (B, V, D); memory reaches the router and, of the policies, the adapters."""
         if self.router is None:
             return self.policies[0](features_BVF, mask_B11V)
-        router_BVN, weights_BVN = self.weights(features_BVF)
+        router_BVN, weights_BVN = self.weights(features_BVF, recalled)
         mixed_BVD: Tensor | None = None
         for index, policy in enumerate(self.policies):
             if self._runs(index, router_BVN):
-                part_BVD = weights_BVN[..., index, None] * policy(features_BVF, mask_B11V)
+                token_BD = recalled.token_BD if recalled is not None and index else None
+                part_BVD = weights_BVN[..., index, None] * policy(features_BVF, mask_B11V, token_BD)
                 mixed_BVD = part_BVD if mixed_BVD is None else mixed_BVD + part_BVD
         return cast(Tensor, mixed_BVD)
 
-    def weights(self, features_BVF: Tensor) -> tuple[Tensor, Tensor]:
+    def weights(self, features_BVF: Tensor, recalled: Recalled | None = None) -> tuple[Tensor, Tensor]:
         """Return the router's softmaxed weights and the signed weights after the gate, both (B, V, N)."""
         if self.router is None:
             ones_BV1 = torch.ones_like(features_BVF[..., :1])
             return ones_BV1, ones_BV1
         logits_BVN = self.router(features_BVF)
+        if recalled is not None:
+            logits_BVN = logits_BVN + recalled.router_BN[:, None]
         if self.top_k < len(self.policies):
             adapters = logits_BVN[..., 1:]
             kept = adapters.topk(self.top_k - 1, -1).indices

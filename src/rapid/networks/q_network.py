@@ -4,7 +4,7 @@ Shapes: B batch, V vehicles, F features, D width, N policies, A actions, L layer
 """
 
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,7 @@ from rapid.data.batch import with_rows
 from rapid.errors import RapidError
 from rapid.networks.blocks import Transformer
 from rapid.networks.encoding import Encoding
+from rapid.networks.memory import Memory, Recalled
 from rapid.networks.mixture import MixtureOfPolicies
 from rapid.networks.mlp import MlpHead, MlpStack
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, MAX_VEHICLES, MIN_VEHICLES, NUM_ACTIONS, SLOWER
@@ -56,20 +57,32 @@ class ActionDecoder(nn.Module):
         self.transformer = Transformer(config.decoder_layers, config.width, config.heads, config.feedforward)
         self.head = nn.Linear(config.width, NUM_ACTIONS)
 
-    def forward(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> Tensor:
-        """Return the Q-values (B, A)."""
-        tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V)
+    def forward(
+        self, tokens_BVD: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None
+    ) -> Tensor:
+        """Return the Q-values (B, A); what is recalled is added to the token that is read."""
+        tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V, recalled_BD)
         return self.head(self.transformer(tokens_BTD, mask_B11T, first_only=True))
 
-    def attention(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> Tensor:
+    def attention(
+        self, tokens_BVD: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None
+    ) -> Tensor:
         """Return the attention of the token that is read to the vehicles (B, L, H, V)."""
-        tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V)
+        tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V, recalled_BD)
         return self.transformer.attention(tokens_BTD, mask_B11T)[:, :, :, 0, -tokens_BVD.shape[1] :]
 
-    def _with_action_token(self, tokens_BVD: Tensor, mask_B11V: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def _with_action_token(
+        self, tokens_BVD: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         if self.action_token is None:
-            return tokens_BVD, mask_B11V
-        tokens_BTD = torch.cat([self.action_token.expand(tokens_BVD.shape[0], -1, -1), tokens_BVD], 1)
+            if recalled_BD is None:
+                return tokens_BVD, mask_B11V
+            return torch.cat([tokens_BVD[:, :1] + recalled_BD[:, None], tokens_BVD[:, 1:]], 1), mask_B11V
+        if recalled_BD is None:
+            first_B1D = self.action_token.expand(tokens_BVD.shape[0], -1, -1)
+        else:
+            first_B1D = self.action_token + recalled_BD[:, None]
+        tokens_BTD = torch.cat([first_B1D, tokens_BVD], 1)
         # Padding with 0 lets every token see the action token.
         return tokens_BTD, None if mask_B11V is None else nn.functional.pad(mask_B11V, (1, 0))
 
@@ -82,9 +95,13 @@ class TokenHead(nn.Module):
         self.mixture = MixtureOfPolicies(config, config.num_policies if config.kind == "rapid" else 1)
         self.decoder = ActionDecoder(config)
 
-    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None) -> Tensor:
+    def forward(
+        self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None
+    ) -> Tensor:
         """Return the Q-values (B, A)."""
-        return self.decoder(self.mixture(features_BVF, mask_B11V), mask_B11V)
+        if recalled is None:
+            return self.decoder(self.mixture(features_BVF, mask_B11V), mask_B11V)
+        return self.decoder(self.mixture(features_BVF, mask_B11V, recalled), mask_B11V, recalled.action_BD)
 
 
 class QNetwork(nn.Module):
@@ -103,6 +120,7 @@ class QNetwork(nn.Module):
         self.encoding = Encoding(config.input, lanes, config.mask_absent, config.vehicles)
         self.head: TokenHead | MlpHead | MlpStack
         self.head = TokenHead(config) if config.kind in ("rapid", "attentive") else MlpHead(config)
+        self.memory = Memory(config, lanes) if config.memory else None
         # A buffer, for a list of indices would be copied to the device at every call.
         self.register_buffer("mirrored_A", torch.tensor(MIRRORED_ACTIONS), persistent=False)
 
@@ -127,9 +145,23 @@ class QNetwork(nn.Module):
         head = self.head
         return head.mixture.gate_NV if isinstance(head, TokenHead) else head.weights_N
 
-    def forward(self, obs_BVF: Tensor) -> Tensor:
-        """Return the Q-values (B, A)."""
+    def forward(self, obs_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
+        """Return the Q-values (B, A).
+
+        A network with a memory is told its state (:mod:`rapid.networks.memory`).
+
+        Raises:
+            RapidError: a state is missing, or is given to a network without a memory.
+        """
         obs_BVF = with_rows(obs_BVF, self.config.vehicles)
+        if (self.memory is None) != (state_BS is None):
+            raise RapidError(
+                "A network with a memory (network.memory) needs its state beside the observations, and one without "
+                "takes none. Ask its agent: agent.start(worlds) gives the first state."
+            )
+        if self.memory is not None and state_BS is not None:
+            features_BVF, mask_B11V = self.encoding(self.memory.believed(obs_BVF, state_BS))
+            return cast(TokenHead, self.head)(features_BVF, mask_B11V, self.memory(obs_BVF, state_BS))
         q_BA = self.head(*self.encoding(obs_BVF))
         if not self.config.mirror:
             return q_BA
@@ -137,20 +169,27 @@ class QNetwork(nn.Module):
         return (q_BA + mirrored_BA.index_select(1, self.mirrored_A)) / 2
 
     @torch.no_grad()
-    def explain(self, obs_BVF: Tensor) -> Explanation:
+    def explain(self, obs_BVF: Tensor, state_BS: Tensor | None = None) -> Explanation:
         """Return the Q-values and what they rest on, for each vehicle."""
         obs_BVF = with_rows(obs_BVF, self.config.vehicles)
-        q_BA = self(obs_BVF)
+        q_BA = self(obs_BVF, state_BS)
         batch, vehicles = obs_BVF.shape[:2]
         hidden_BVVF = obs_BVF[:, None] * (1 - torch.eye(vehicles, device=obs_BVF.device))[:, :, None]
-        q_without_BVA = self(hidden_BVVF.flatten(0, 1)).view(batch, vehicles, -1)
+        # Who is asked about every vehicle remembers the same each time.
+        states = None if state_BS is None else state_BS.repeat_interleave(vehicles, 0)
+        q_without_BVA = self(hidden_BVVF.flatten(0, 1), states).view(batch, vehicles, -1)
         q_without_BVA[:, 0] = q_BA
         if not isinstance(self.head, TokenHead):
             return Explanation(q_BA, q_without_BVA, None, None, None, None)
+        recalled = None
+        if self.memory is not None and state_BS is not None:
+            recalled, obs_BVF = self.memory(obs_BVF, state_BS), self.memory.believed(obs_BVF, state_BS)
         features_BVF, mask_B11V = self.encoding(obs_BVF)
         mixture = self.head.mixture
-        router_BVN, weights_BVN = mixture.weights(features_BVF)
-        attention_BLHV = self.head.decoder.attention(mixture(features_BVF, mask_B11V), mask_B11V)
+        router_BVN, weights_BVN = mixture.weights(features_BVF, recalled)
+        attention_BLHV = self.head.decoder.attention(
+            mixture(features_BVF, mask_B11V, recalled), mask_B11V, None if recalled is None else recalled.action_BD
+        )
         gate_NV = mixture.gate_NV.detach().clone()
         return Explanation(q_BA, q_without_BVA, weights_BVN, router_BVN, gate_NV, attention_BLHV)
 
@@ -159,8 +198,11 @@ def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
     """Return a new network whose weights depend on `config` and `seed` alone, with every parameter trainable.
 
     Raises:
-        RapidError: N < 1, K outside 1..N, a width that the heads do not divide, or vehicles outside 2..51.
+        RapidError: N < 1, K outside 1..N, a width that the heads do not divide, vehicles outside 2..51, or a memory
+            that :func:`check_memory` refuses.
     """
+    if config.memory:
+        check_memory(config)
     if config.num_policies < 1 or not 1 <= config.top_k <= config.num_policies:
         raise RapidError(
             f"A network with num_policies N = {config.num_policies} and top_k K = {config.top_k} cannot be built: "
@@ -236,13 +278,16 @@ def _initialize(network: QNetwork, generator: torch.Generator) -> None:
     for module in network.modules():
         if isinstance(module, nn.Linear):
             bound = module.in_features**-0.5
-            for parameter in (module.weight, module.bias):
+            for parameter in module.parameters():
                 parameter.uniform_(-bound, bound, generator=generator)
     for name, parameter in network.named_parameters():
         if name.endswith(("position", "action_token")):
             parameter.normal_(0, 0.02, generator=generator)
         elif name.endswith("weights_N"):
             parameter[0] = 1
+    if network.memory is not None:
+        # So that what has learned without a memory acts, bit for bit, as it did.
+        network.memory.out.weight.zero_()
 
 
 def set_phase(network: QNetwork, phase: Phase, freeze_decoder: bool = False) -> None:
@@ -282,3 +327,34 @@ def set_phase(network: QNetwork, phase: Phase, freeze_decoder: bool = False) -> 
         if not isinstance(head, TokenHead):
             raise RapidError(f"A '{network.config.kind}' network has no decoder to freeze. Unset freeze_decoder.")
         head.decoder.requires_grad_(False)
+
+
+def with_memory(network: QNetwork) -> QNetwork:
+    """Return the network as one that has a memory; it acts as it did, bit for bit, until it has learned to use it.
+
+    Raises:
+        RapidError: what :func:`check_memory` refuses.
+    """
+    config = replace(network.config, memory=True)
+    check_memory(config)
+    if network.memory is not None:
+        return network
+    other = build_network(config, network.lanes, seed=0).to(network.scale_F.device)
+    memory = {name: value for name, value in other.state_dict().items() if name.startswith("memory.")}
+    other.load_state_dict(network.state_dict() | memory)
+    return other.train(network.training)
+
+
+def check_memory(config: NetworkConfig) -> None:
+    """Check that a network of these settings can have a memory.
+
+    Raises:
+        RapidError: it has no tokens, or averages with the mirror image.
+    """
+    if config.kind not in ("rapid", "attentive"):
+        raise RapidError(
+            f"A network of kind '{config.kind}' has no tokens that a memory could speak to. Unset memory, or choose "
+            "network.kind rapid or attentive."
+        )
+    if config.mirror:
+        raise RapidError("A memory tells left from right, the mirror does not. Unset memory or mirror.")

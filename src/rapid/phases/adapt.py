@@ -9,7 +9,7 @@ from rapid.config import Config, without_place
 from rapid.config_io import to_dict
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
-from rapid.networks.q_network import widened
+from rapid.networks.q_network import check_memory, widened, with_memory
 from rapid.phases.data import learnable
 from rapid.phases.measure import learning_curve
 from rapid.progress import task
@@ -40,6 +40,12 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
         network = widened(network, settings.vehicles)
     if settings.mirror:
         network.config = replace(network.config, mirror=True)
+    if settings.memory:
+        check_memory(network.config)
+    if network.memory is not None and settings.steps:
+        raise RapidError(
+            f"'{agent}' has a memory, and Q-learning keeps none. Set adapt.steps to 0, to go on by PPO alone."
+        )
     check_road(QAgent(network, distilled.name), scenario)
     evaluate, seen = learning_curve(config, scenario, name), seeing(network.config.vehicles)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
@@ -60,6 +66,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 track=tracker.log,
             )
         if settings.ppo.steps:
+            if settings.memory:
+                network = with_memory(network)
             timed = replace(get_scenario(scenario), clock=True)
             adapt_by_ppo(
                 network,

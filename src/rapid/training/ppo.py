@@ -3,16 +3,16 @@
 Q-learning discounts, and no observation tells when an episode ends, so what it optimises is not quite what is measured:
 the sum of rewards until the time is up. From what it has found, PPO goes on with just that. The policy is softmax(Q/T),
 so afterwards Q-values are preferences, no longer estimates of a return. The critic, needed in training alone, is told
-the time that the policy does not see (an asymmetric actor-critic; Pinto et al., 2018).
+the time that the policy does not see (an asymmetric actor-critic; Pinto et al., 2018). Under attack
+(`adapt.adversary`) the policy alone sees what is left of an observation (:mod:`rapid.training.collector`).
 
-Shapes: T steps of a rollout, W worlds, N = T*W transitions, B a minibatch, V vehicles, F features, A actions.
+Shapes: N transitions of a rollout, B a minibatch, V vehicles, F features, S entries of a state, A actions.
 """
 
 import os
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,8 +23,8 @@ from rapid.losses import policy_gradient_loss
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
-from rapid.seeding import numpy_stream, stream_seed, torch_stream
-from rapid.training.learner import check_generator
+from rapid.seeding import numpy_stream, stream_seed
+from rapid.training.collector import Collector, Rollout
 from rapid.training.machinery.adam import Adam, clip_norm, flush_denormals
 from rapid.training.machinery.diagnostics import Forgetting, gate_size
 from rapid.training.machinery.record import Evaluate, Record, Track, crossed, network_fingerprint
@@ -35,19 +35,6 @@ VALUE_SCALE = 10.0
 TERMS = ("value", "policy", "entropy", "kl")
 """What is recorded of every update, the first alone while only the critic learns; `kl` estimates how far the policy has
 moved from the one that drove."""
-
-
-class Rollout(NamedTuple):
-    """N transitions of one policy, with what is learned from them."""
-
-    obs_NVF: Tensor
-    """The observation with the time told, as the critic sees it."""
-    action_N: Tensor
-    log_prob_N: Tensor
-    """Of the action, under the policy that drove."""
-    advantage_N: Tensor
-    return_N: Tensor
-    """The critic's target."""
 
 
 @flush_denormals()
@@ -114,30 +101,24 @@ def adapt_by_ppo(
     set_phase(network, "adapt" if config.train == "adapter" else "all", config.freeze_decoder)
     learner = PpoLearner(network, ppo, config.optimizer.gate_rate, seen.clock, seed, rollouts)
     make_worlds = make_worlds or default_worlds(replace(seen, clock=True), network.config.vehicles)
-    drive = Drive(make_worlds, ppo.num_envs, stream_seed(seed, "ppo"))
-    sampler = torch_stream(seed, "ppo/actions", device)
+    lanes = network.lanes if network.config.memory else None
+    drive = Drive(make_worlds, ppo.num_envs, stream_seed(seed, "ppo"), lanes)
+    collector = Collector(drive, ppo, config.adversary, network.scale_F, seed, device)
     before = -(-config.steps // config.num_envs) * config.num_envs
     done = 0
 
     def state() -> dict[str, Any]:
-        return {
-            "learner": learner.state_dict(),
-            "drive": drive.state_dict(),
-            "sampler": sampler.get_state(),
-            "rollouts": done,
-        }
+        return {"learner": learner.state_dict(), "collector": collector.state_dict(), "rollouts": done}
 
     if (saved := record.resume()) is not None:
-        check_generator(sampler, saved["sampler"])
+        collector.load_state_dict(saved["collector"])
         learner.load_state_dict(saved["learner"])
-        drive.load_state_dict(saved["drive"])
-        sampler.set_state(saved["sampler"])
         done = saved["rollouts"]
         if progress:
             progress.skip(done * per_rollout)
 
     while done < rollouts:
-        learner.update(collect(learner, drive, ppo, sampler, device))
+        learner.update(collector.collect(learner, done / rollouts))
         done += 1
         steps, last = before + done * per_rollout, done == rollouts
         row = {
@@ -187,7 +168,9 @@ class PpoLearner:
         self._adam, self._critic_adam = Adam(self._trained, rates), Adam(self._critics)
         self._rng = numpy_stream(seed, "ppo/minibatches")
         self.rollouts = self.updates = 0
+        self._values: list[Tensor] = []
         self._terms: list[Tensor] = []
+        self._far = False
 
     @property
     def learning_rate(self) -> float:
@@ -196,10 +179,17 @@ class PpoLearner:
             return 0.0
         return self.config.learning_rate * max(1 - self.rollouts / self.planned, 0.0)
 
-    def log_probs(self, obs_BVF: Tensor) -> Tensor:
-        """Return the policy's log-probabilities (B, A) = log softmax(Q / T)."""
-        seen_BVF = obs_BVF if self._sees_clock else without_clock(obs_BVF)
-        return (self.network(seen_BVF) / self.config.temperature).log_softmax(1)
+    def as_seen(self, obs_BVF: Tensor) -> Tensor:
+        """Return the observations as the policy may see them."""
+        return obs_BVF if self._sees_clock else without_clock(obs_BVF)
+
+    def q_values(self, seen_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
+        """Return the policy's Q-values (B, A)."""
+        return self.network(seen_BVF) if state_BS is None else self.network(seen_BVF, state_BS)
+
+    def log_probs(self, seen_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
+        """Return the policy's log-probabilities (B, A) = log softmax(Q / T) for what it sees and remembers."""
+        return (self.q_values(seen_BVF, state_BS) / self.config.temperature).log_softmax(1)
 
     def values(self, obs_BVF: Tensor) -> Tensor:
         """Return what the critic expects until the end of the episode (B,)."""
@@ -208,30 +198,39 @@ class PpoLearner:
     def update(self, rollout: Rollout) -> None:
         """Learn from a rollout: several passes over it in minibatches."""
         rate, count = self.learning_rate, len(rollout.action_N)
+        self._far = False
         for _ in range(self.config.epochs):
             order_N = torch.from_numpy(self._rng.permutation(count)).to(rollout.obs_NVF.device)
             for rows_B in order_N.split(self.config.batch_size):
-                self._terms.append(self._take_step(Rollout(*(column[rows_B] for column in rollout)), rate))
+                columns = (None if column is None else column[rows_B] for column in rollout)
+                self._take_step(Rollout(*columns), rate)
                 self.updates += 1
         self.rollouts += 1
 
-    def _take_step(self, batch: Rollout, rate: float) -> Tensor:
+    def _take_step(self, batch: Rollout, rate: float) -> None:
         value = (self.values(batch.obs_NVF) - batch.return_N).div(VALUE_SCALE).square().mean()
         gradients = torch.autograd.grad(value, self._critics, materialize_grads=True)
         clip_norm(gradients, self.config.critic_max_grad_norm)
         self._critic_adam.step(gradients, self.config.critic_rate)
-        if not rate:
-            return torch.stack([value.detach()])
-        log_prob_BA = self.log_probs(batch.obs_NVF)
+        self._values.append(value.detach())
+        if not rate or self._far:
+            return
+        log_prob_BA = self.log_probs(batch.seen_NVF, batch.state_NS)
         log_prob_B = log_prob_BA.gather(1, batch.action_N[:, None]).squeeze(1)
+        with torch.no_grad():
+            moved_B = log_prob_B - batch.log_prob_N
+            if self.config.largest_kl:
+                # An estimate that is never below 0, of each transition (Schulman, 2020: "Approximating KL divergence").
+                self._far = bool((moved_B.exp() - 1 - moved_B).mean() > self.config.largest_kl)
+                if self._far:
+                    return
         policy = policy_gradient_loss(log_prob_B, batch.log_prob_N, batch.advantage_N, self.config.clip)
-        gradients = torch.autograd.grad(policy, self._trained, materialize_grads=True)
+        entropy = -(log_prob_BA.exp() * log_prob_BA).sum(1).mean()
+        sought = policy - self.config.entropy * entropy if self.config.entropy else policy
+        gradients = torch.autograd.grad(sought, self._trained, materialize_grads=True)
         clip_norm(gradients, self.config.max_grad_norm)
         self._adam.step(gradients, rate)
-        with torch.no_grad():
-            entropy = -(log_prob_BA.exp() * log_prob_BA).sum(1).mean()
-            kl = (batch.log_prob_N - log_prob_B).mean()
-        return torch.stack([value.detach(), policy.detach(), entropy, kl])
+        self._terms.append(torch.stack([policy.detach(), entropy.detach(), -moved_B.mean()]))
 
     def means(self) -> dict[str, float]:
         """Return the mean of every term over the updates since the last call, and forget them.
@@ -239,15 +238,19 @@ class PpoLearner:
         Raises:
             RapidError: a term or a weight is not finite.
         """
-        terms_UT = torch.stack(self._terms).cpu()
+        value_U = torch.stack(self._values).cpu().double()
+        terms_UT = torch.stack(self._terms).cpu().double() if self._terms else torch.zeros(0, 0)
+        self._values.clear()
         self._terms.clear()
         trained = (*self._trained, *self._critics)
-        if not terms_UT.isfinite().all() or not all(bool(weight.isfinite().all()) for weight in trained):
+        finite = bool(value_U.isfinite().all()) and bool(terms_UT.isfinite().all())
+        if not finite or not all(bool(weight.isfinite().all()) for weight in trained):
             raise RapidError(
                 f"Training stopped by update {self.updates} of PPO: a loss or a weight is not finite. Lower "
                 "adapt.ppo.learning_rate or adapt.ppo.critic_rate."
             )
-        return dict(zip(TERMS, terms_UT.double().mean(0).tolist(), strict=False))
+        means = terms_UT.mean(0).tolist() if len(terms_UT) else []
+        return dict(zip(TERMS, [float(value_U.mean()), *means], strict=False))
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that `load_state_dict` needs; call `means` first, the recorded terms are not in it."""
@@ -271,70 +274,6 @@ class PpoLearner:
         self.rollouts, self.updates = state["rollouts"], state["updates"]
 
 
-@torch.no_grad()
-def collect(learner: PpoLearner, drive: Drive, config: PpoConfig, generator: torch.Generator, device: str) -> Rollout:
-    """Drive every world for `config.rollout` steps and return what there is to learn.
-
-    A crash costs `config.crash_penalty` more here than in the return that is reported.
-
-    Raises:
-        RapidError: an observation or a Q-value is not finite.
-    """
-    obs: list[Tensor] = []
-    actions: list[Tensor] = []
-    log_probs: list[Tensor] = []
-    rewards: list[Tensor] = []
-    ended: list[Tensor] = []
-    for _ in range(config.rollout):
-        obs_WVF = torch.from_numpy(drive.obs_WVF).to(device)
-        log_prob_WA = learner.log_probs(obs_WVF)
-        if not log_prob_WA.isfinite().all():
-            raise RapidError(
-                f"Training stopped after update {learner.updates} of PPO: an observation or a Q-value is not finite. "
-                "The worlds are at fault if an observation is; else lower adapt.ppo.learning_rate."
-            )
-        action_W = torch.multinomial(log_prob_WA.exp(), 1, generator=generator).squeeze(1)
-        _, _, reward_W, _, terminated_W, truncated_W = drive.step(action_W.cpu().numpy())
-        obs.append(obs_WVF)
-        actions.append(action_W)
-        log_probs.append(log_prob_WA.gather(1, action_W[:, None]).squeeze(1))
-        reward_W = reward_W - config.crash_penalty * terminated_W
-        rewards.append(torch.from_numpy(reward_W.astype(np.float32)).to(device))
-        ended.append(torch.from_numpy(terminated_W | truncated_W).to(device))
-    # After an end comes the next episode, whose first value counts for nothing.
-    last_WVF = torch.from_numpy(drive.obs_WVF).to(device)
-    value_TW = torch.stack([learner.values(obs_WVF) for obs_WVF in [*obs, last_WVF]])
-    reward_TW, ended_TW = torch.stack(rewards), torch.stack(ended)
-    advantage_TW = advantages(reward_TW, value_TW, ended_TW, config.discount, config.trace)
-    return Rollout(
-        torch.cat(obs),
-        torch.cat(actions),
-        torch.cat(log_probs),
-        advantage_TW.flatten(),
-        (advantage_TW + value_TW[:-1]).flatten(),
-    )
-
-
-def advantages(reward_TW: Tensor, value_TW: Tensor, ended_TW: Tensor, discount: float, trace: float) -> Tensor:
-    """Return generalised advantage estimates (T, W) (Schulman et al., 2016: equation 16).
-
-    Args:
-        reward_TW: the rewards.
-        value_TW: the critic's values, (T + 1, W): of the state before each step and after the last.
-        ended_TW: bool: whether the episode ended with this step, by a crash or because the time was up.
-        discount: gamma.
-        trace: lambda.
-    """
-    found_TW = torch.zeros_like(reward_TW)
-    after_W = torch.zeros_like(reward_TW[0])
-    for step in range(len(reward_TW) - 1, -1, -1):
-        on_W = discount * (~ended_TW[step]).to(reward_TW.dtype)
-        error_W = reward_TW[step] + on_W * value_TW[step + 1] - value_TW[step]
-        after_W = error_W + trace * on_W * after_W
-        found_TW[step] = after_W
-    return found_TW
-
-
 def without_clock(obs_BVF: Tensor) -> Tensor:
     """Return observations of a scenario with a clock as those without one give them: the ego's presence is 1."""
     hidden_BVF = obs_BVF.clone()
@@ -344,4 +283,4 @@ def without_clock(obs_BVF: Tensor) -> Tensor:
 
 def _critic(config: NetworkConfig) -> NetworkConfig:
     """Return the settings of the critic's network: a single policy of the same size, or an MLP."""
-    return replace(config, kind="mlp" if config.kind.startswith("mlp") else "attentive")
+    return replace(config, kind="mlp" if config.kind.startswith("mlp") else "attentive", memory=False)
