@@ -105,5 +105,5 @@ def test_what_is_said_of_a_decision_is_of_the_state_it_was_made_in():
 def test_who_forgets_the_state_is_told():
     agent = remembering()
     obs = np.array(make_vec(SCENARIO, 2).reset(seed=[1, 2])[0])
-    with pytest.raises(RapidError, match="agent.start"):
+    with pytest.raises(RapidError, match=r"agent\.start"):
         agent.act(obs)

@@ -32,9 +32,7 @@ class PolicyEncoder(nn.Module):
             self.position = None
         self.transformer = Transformer(config.layers, config.width, config.heads, config.feedforward)
 
-    def forward(
-        self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None) -> Tensor:
         """Return the policy's tokens (B, V, D); what is recalled is added to each."""
         tokens_BVD = self.projection(features_BVF)
         if recalled_BD is not None:
@@ -66,9 +64,7 @@ class MixtureOfPolicies(nn.Module):
         self.stays_closed = False
         """Whether the gate is 0 and is not trained. A recording on a GPU, which cannot look, goes by it."""
 
-    def forward(
-        self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None
-    ) -> Tensor:
+    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None) -> Tensor:
         """Return the mixed tokens (B, V, D); memory reaches the router and, of the policies, the adapters."""
         if self.router is None:
             return self.policies[0](features_BVF, mask_B11V)

@@ -57,16 +57,12 @@ class ActionDecoder(nn.Module):
         self.transformer = Transformer(config.decoder_layers, config.width, config.heads, config.feedforward)
         self.head = nn.Linear(config.width, NUM_ACTIONS)
 
-    def forward(
-        self, tokens_BVD: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, tokens_BVD: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None) -> Tensor:
         """Return the Q-values (B, A); what is recalled is added to the token that is read."""
         tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V, recalled_BD)
         return self.head(self.transformer(tokens_BTD, mask_B11T, first_only=True))
 
-    def attention(
-        self, tokens_BVD: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None
-    ) -> Tensor:
+    def attention(self, tokens_BVD: Tensor, mask_B11V: Tensor | None, recalled_BD: Tensor | None = None) -> Tensor:
         """Return the attention of the token that is read to the vehicles (B, L, H, V)."""
         tokens_BTD, mask_B11T = self._with_action_token(tokens_BVD, mask_B11V, recalled_BD)
         return self.transformer.attention(tokens_BTD, mask_B11T)[:, :, :, 0, -tokens_BVD.shape[1] :]
@@ -95,9 +91,7 @@ class TokenHead(nn.Module):
         self.mixture = MixtureOfPolicies(config, config.num_policies if config.kind == "rapid" else 1)
         self.decoder = ActionDecoder(config)
 
-    def forward(
-        self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None
-    ) -> Tensor:
+    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None) -> Tensor:
         """Return the Q-values (B, A)."""
         if recalled is None:
             return self.decoder(self.mixture(features_BVF, mask_B11V), mask_B11V)

@@ -61,6 +61,19 @@ class Rollout(NamedTuple):
     return_N: Tensor
     """The critic's target."""
 
+    def rows(self, rows_B: Tensor) -> "Rollout":
+        """Return some of the transitions."""
+        state_BS = None if self.state_NS is None else self.state_NS[rows_B]
+        return Rollout(
+            self.obs_NVF[rows_B],
+            self.seen_NVF[rows_B],
+            state_BS,
+            self.action_N[rows_B],
+            self.log_prob_N[rows_B],
+            self.advantage_N[rows_B],
+            self.return_N[rows_B],
+        )
+
 
 class Collector:
     """Drives worlds for a learner and remembers where they are, savable as a whole.

@@ -202,8 +202,7 @@ class PpoLearner:
         for _ in range(self.config.epochs):
             order_N = torch.from_numpy(self._rng.permutation(count)).to(rollout.obs_NVF.device)
             for rows_B in order_N.split(self.config.batch_size):
-                columns = (None if column is None else column[rows_B] for column in rollout)
-                self._take_step(Rollout(*columns), rate)
+                self._take_step(rollout.rows(rows_B), rate)
                 self.updates += 1
         self.rollouts += 1
 
