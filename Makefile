@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 RUN_ARGS ?=
 TEST_ARGS ?=
 
-.PHONY: help install run test check format bench clean
+.PHONY: help install run test check docs format bench clean
 .DEFAULT_GOAL := help
 
 help: ## show this
@@ -28,6 +28,10 @@ check: $(VENV)/.installed-dev ## format, lint and type checks
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+
+docs: $(VENV)/.installed-docs ## build the documentation site into build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build -q
+	@echo 'Open build/site/index.html'
 
 format: $(VENV)/.installed-dev ## rewrite the code as `make check` wants it
 	$(BIN)/ruff format .
@@ -61,4 +65,9 @@ $(VENV)/.installed: $(VENV)/.torch pyproject.toml constraints.txt
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo 'Installing the development tools ...'
 	@$(PIP) install -qq -c constraints.txt -e '.[dev,minari,export,sb3]'
+	@touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed-dev
+	@echo 'Installing what builds the documentation ...'
+	@$(PIP) install -qq -c constraints.txt -e '.[docs]'
 	@touch $@

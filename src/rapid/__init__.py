@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rapid.simulator import make_sb3_vec as make_sb3_vec
     from rapid.simulator import make_vec as make_vec
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["__version__", "load_agent", "load_dataset", "make_env", "make_sb3_vec", "make_vec"]
 
 _HOME = {

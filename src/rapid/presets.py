@@ -256,7 +256,7 @@ def offline_baseline(config: Config, algorithm: OfflineBaseline) -> Config:
 
 
 MLP_DISCOUNT = 0.93
-"""Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log.md)."""
+"""Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log/)."""
 
 OnlineBaseline = Literal["dqn", "ddqn", "munchausen"]
 

@@ -138,7 +138,7 @@ EPOCH: dict[str, int] = {
     "scenes": 1,
     "decide": 1,
 }
-"""Raised by hand where a change of the program changes results, with a line in docs/log.md: older ones are then made
+"""Raised by hand where a change of the program changes results, with a line in docs/log/: older ones are then made
 anew."""
 
 INTRODUCED: dict[str, Any] = {}
