@@ -1,5 +1,6 @@
 """Rollouts: finished worlds count no further, the true observation is measured, noise is each episode's own."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,9 @@ from rapid.errors import RapidError
 from rapid.evaluation import rollouts
 from rapid.evaluation.recording import Recording, load_recordings, save_recordings
 from rapid.evaluation.rollouts import evaluate_agent, is_applicable, run_episodes
+from rapid.pages.episodes import moving_picture
 from rapid.scenarios import FASTER, IDLE, LANE_RIGHT
+from rapid.teacher.decision import Decision
 
 SCENARIO = "lane-3-density-2"
 
@@ -130,7 +133,7 @@ def test_teacher_gets_its_own_last_decision_and_a_key_per_decision(toy) -> None:
 
         def decide(self, obs_BVF, previous, keys_B):
             calls.append((list(previous), keys_B.tolist()))
-            return [SimpleNamespace(action=FASTER, explanation=f"gap {obs[1, 1] - obs[0, 1]:.0f} m") for obs in obs_BVF]
+            return [Decision(FASTER, explanation=f"gap {obs[1, 1] - obs[0, 1]:.0f} m") for obs in obs_BVF]
 
     episodes = run_episodes(Teacher(), SCENARIO, [10, 14], record=True)
     assert [len(previous) for previous, _ in calls] == [2, 2, 2, 1, 1, 1, 1]
@@ -141,7 +144,34 @@ def test_teacher_gets_its_own_last_decision_and_a_key_per_decision(toy) -> None:
     calls.clear()
     run_episodes(Teacher(), SCENARIO, [14])
     assert calls[0][1][0] == keys[1]
-    assert episodes.recordings[1].explanations == ("gap 45 m",) * 7
+    # A rule's reason is ours: no model said it.
+    assert (episodes.recordings[1].computed, episodes.recordings[1].answered) == (("gap 45 m",) * 7, ())
+
+
+def test_what_was_told_answered_and_computed_is_recorded_apart(toy, tmp_path) -> None:
+    talk = json.dumps([{"role": "assistant", "content": "look {}"}, {"role": "user", "content": "RESULT free"}])
+    odds = (0.0, 0.25, 0.0, 0.75, 0.0)
+
+    class Teacher:
+        name = "teacher"
+
+        def decide(self, obs_BVF, previous, keys_B):
+            fallback = Decision(FASTER, status="fallback", told="Faster?", turns=talk, computed="the rule's choice")
+            word = Decision(FASTER, answer="faster", status="ok", told="Faster?", probabilities=odds, computed="9 m")
+            return [word if previous[0] is None else fallback for _ in obs_BVF]
+
+    found = run_episodes(Teacher(), SCENARIO, [10], record=True).recordings[0]
+    save_recordings(tmp_path / "r.json", [found])
+    for one in (found, load_recordings(tmp_path / "r.json")[0]):
+        assert set(one.told) == {"Faster?"}
+        assert one.answered[:2] == ("faster", "model: look {}\ntool: RESULT free")
+        assert one.computed[:2] == ("9 m", "the rule's choice")
+        assert one.odds_TA[0].tolist() == list(odds)
+        assert np.isnan(one.odds_TA[1]).all()
+    picture = moving_picture(found)
+    assert picture["odds"][:2] == [list(odds), None]
+    assert (picture["told"], picture["answered"][0], picture["computed"][0]) == (["Faster?"] * 3, "faster", "9 m")
+    assert json.dumps(picture, allow_nan=False)
 
 
 def test_agent_bound_to_the_worlds_gets_all_of_them(toy, constant) -> None:

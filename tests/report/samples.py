@@ -49,7 +49,7 @@ def recording(said: str = "the lane is free", q: bool = True) -> Recording:
         np.array([0.5, 0.6, np.nan]),
         True,
         values,
-        (said,) * 3,
+        answered=(said,) * 3,
     )
 
 

@@ -31,7 +31,7 @@ def ride(length: int, agent: str = "teacher", seed: int = 900_000) -> Recording:
         action_T=np.arange(length) % 5,
         reward_T=np.full(length, 0.5),
         q_TA=np.tile(np.arange(5, dtype=np.float32), (length, 1)),
-        explanations=tuple(f"words {t}" for t in range(length)),
+        answered=tuple(f"words {t}" for t in range(length)),
         crashed=False,
     )
 

@@ -13,12 +13,13 @@ from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import Kind
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
+from rapid.teacher.decision import Decision
 
 PLANNERS = ("planner", "planner-cars", "planner-observation")
 """Searches in the simulator: with perfect knowledge, of all cars but not of their drivers, and of what is observed."""
 
-Said = tuple[NDArray[np.float32] | None, str]
-"""The values of the actions, if the driver has any, and its words, if it says any."""
+Said = tuple[NDArray[np.float32] | None, Decision | None]
+"""The values of the actions, if the driver has any, and its decision, if it is one that speaks."""
 
 
 class Driver(Protocol):
@@ -146,11 +147,11 @@ class _AgentDriver:
     def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
         values = getattr(self._agent, "q_values", None)
         if not callable(values):
-            return [(None, "")] * len(worlds)
+            return [(None, None)] * len(worlds)
         if self._before_BS is not None:
-            return [(q_A, "") for q_A in np.asarray(values(seen_BVF[worlds], self._before_BS), np.float32)]
+            return [(q_A, None) for q_A in np.asarray(values(seen_BVF[worlds], self._before_BS), np.float32)]
         q_BA = np.asarray(values(seen_BVF if self._everywhere else seen_BVF[worlds]), np.float32)
-        return [(q_A, "") for q_A in (q_BA[worlds] if self._everywhere else q_BA)]
+        return [(q_A, None) for q_A in (q_BA[worlds] if self._everywhere else q_BA)]
 
 
 class _TeacherDriver:
@@ -176,4 +177,5 @@ class _TeacherDriver:
         return np.array([int(decision.action) for decision in decisions], np.int64)
 
     def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
-        return [(None, str(getattr(self.previous[int(world)], "explanation", "") or "")) for world in worlds]
+        decisions = [self.previous[int(world)] for world in worlds]
+        return [(None, decision if isinstance(decision, Decision) else None) for decision in decisions]

@@ -35,8 +35,14 @@ class Recording:
     crashed: bool
     q_TA: NDArray[np.float32] | None = None
     """The agent's values of the actions, if it has any."""
-    explanations: tuple[str, ...] = ()
-    """What a teacher said at each decision."""
+    told: tuple[str, ...] = ()
+    """What a model was told at each decision, without the part of the prompt that never changes."""
+    answered: tuple[str, ...] = ()
+    """What it answered; of a conversation the turns."""
+    odds_TA: NDArray[np.float32] | None = None
+    """Its probability of each action; rows of NaN where it gave none."""
+    computed: tuple[str, ...] = ()
+    """What RAPID computed about the action taken, or a rule's reason; no model said it."""
     seen_TVF: NDArray[np.float32] | None = None
     """What the agent was made to see at each of the T decisions; None where it saw the truth."""
     weights_TVN: NDArray[np.float32] | None = None
@@ -105,11 +111,6 @@ def load_recordings(path: str | os.PathLike[str]) -> list[Recording]:
         raise RapidError(f"'{path}' is not a file of recorded episodes ({error}). Record them again.") from error
 
 
-def explained(recording: Recording, explanations: Sequence[str]) -> Recording:
-    """Return the recording with what a teacher said at each decision."""
-    return replace(recording, explanations=tuple(explanations))
-
-
 def explained_by(agent: Any, recording: Recording) -> Recording:
     """Return the recording with how the agent's network weighs its policies and attends to vehicles, if it does."""
     explain = getattr(agent, "explain", None)
@@ -138,7 +139,10 @@ def _to_dict(recording: Recording) -> dict[str, Any]:
         "actions": recording.action_T.tolist(),
         "rewards": [_number(reward) for reward in recording.reward_T],
         "q": q,
-        "explanations": list(recording.explanations),
+        "told": list(recording.told),
+        "answered": list(recording.answered),
+        "odds": _flat(recording.odds_TA),
+        "computed": list(recording.computed),
         "observations": _flat(recording.obs_TVF),
         "seen": _flat(recording.seen_TVF),
         "policies": 1 if recording.weights_TVN is None else recording.weights_TVN.shape[-1],
@@ -177,7 +181,11 @@ def _from_dict(episode: dict[str, Any]) -> Recording:
         action_T=np.array(episode["actions"], np.int64),
         reward_T=np.array([math.nan if v is None else v for v in episode["rewards"]], np.float64),
         q_TA=None if episode["q"] is None else array(episode["q"]),
-        explanations=tuple(episode["explanations"]),
+        # What earlier versions called explanations mixed what was answered with what was computed: it is left out.
+        told=tuple(episode.get("told", ())),
+        answered=tuple(episode.get("answered", ())),
+        odds_TA=shaped("odds"),
+        computed=tuple(episode.get("computed", ())),
         seen_TVF=shaped("seen", NUM_FEATURES),
         weights_TVN=shaped("weights", episode.get("policies", 1)),
         attention_TV=shaped("attention"),

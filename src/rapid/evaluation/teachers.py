@@ -201,7 +201,7 @@ class _Listener:
         return chosen
 
     def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
-        return [(None, "")] * len(worlds)
+        return [(None, None)] * len(worlds)
 
     def ended(self, count: float) -> None:
         """Count an episode that ended, perhaps early."""

@@ -1,7 +1,8 @@
 """Worlds under way side by side, and what is measured of them step by step."""
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +17,7 @@ from rapid.evaluation.metrics import time_to_collision
 from rapid.evaluation.recording import Recording
 from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS, NUM_VEHICLES
 from rapid.seeding import torch_stream
+from rapid.teacher.decision import Decision, answer_in_words, computed_in_words
 
 
 class Perturbation:
@@ -143,11 +145,26 @@ class Worlds:
                     reward_T=np.array([step.reward for step in steps], np.float64),
                     crashed=bool(self.crashed_B[world]),
                     q_TA=np.stack([q for q in values if q is not None]) if values[0] is not None else None,
-                    explanations=tuple(step.said for step in steps) if any(step.said for step in steps) else (),
+                    **_words([step.decision for step in steps]),
                     seen_TVF=None if attack == "none" else np.stack([step.seen_VF for step in steps]),
                 )
             )
         return found
+
+
+def _words(decisions: Sequence[Decision | None]) -> dict[str, Any]:
+    """Return what was told, answered and computed at each decision of an episode, of each nothing if there is none."""
+    made = [decision for decision in decisions if decision is not None]
+    if not made or len(made) < len(decisions):
+        return {}
+    odds_TA = np.array([decision.probabilities or (math.nan,) * NUM_ACTIONS for decision in made], np.float32)
+    texts = {
+        "told": [decision.told for decision in made],
+        "answered": list(map(answer_in_words, made)),
+        "computed": list(map(computed_in_words, made)),
+    }
+    found: dict[str, Any] = {name: tuple(lines) for name, lines in texts.items() if any(lines)}
+    return found | ({} if np.isnan(odds_TA).all() else {"odds_TA": odds_TA})
 
 
 @dataclass
@@ -157,7 +174,7 @@ class _Step:
     before: NDArray[np.float32]
     action: int
     q_A: NDArray[np.float32] | None
-    said: str
+    decision: Decision | None
     seen_VF: NDArray[np.float32]
     reward: float = 0.0
     after: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))

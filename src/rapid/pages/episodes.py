@@ -43,8 +43,15 @@ def moving_picture(recording: Recording) -> dict[str, Any]:
         "q": None if recording.q_TA is None else rounded(recording.q_TA),
         "routing": None if recording.weights_TVN is None else rounded(recording.weights_TVN, 3),
         "attention": None if recording.attention_TV is None else rounded(recording.attention_TV, 3),
-        "answered": list(recording.explanations),
+        "told": list(recording.told),
+        "answered": list(recording.answered),
+        "odds": None if recording.odds_TA is None else [_odds(row_A) for row_A in recording.odds_TA],
+        "computed": list(recording.computed),
     }
+
+
+def _odds(row_A: NDArray[np.float32]) -> list[float] | None:
+    return None if np.isnan(row_A).any() else rounded(row_A)
 
 
 def frame(scene_VF: NDArray[np.float32], tracks_V: NDArray[np.int64]) -> list[list[float]]:

@@ -180,6 +180,11 @@ def read_choice(
     return _checked(action, explanation, facts)
 
 
+def is_placeholder(explanation: str) -> bool:
+    """Whether a reason is none, or the one that stands in the form of the answer."""
+    return explanation.strip(" .…\"'").lower() in _PLACEHOLDERS
+
+
 class _DoubtError(Exception):
     """An answer that may be read in more than one way."""
 
@@ -233,8 +238,7 @@ def _checked(action: int, explanation: str, facts: Facts) -> Choice:
         return Choice(None, fault=f"The action {WORDS[action]} is not possible here.")
     # On one line: it is fed back, and must not look like other lines of a prompt.
     explanation = " ".join(explanation.split())
-    copied = explanation.strip(" .…\"'").lower() in _PLACEHOLDERS
-    return Choice(action, "" if copied else explanation[:EXPLANATION_LIMIT])
+    return Choice(action, "" if is_placeholder(explanation) else explanation[:EXPLANATION_LIMIT])
 
 
 def _named(value: Any) -> int | None:

@@ -129,6 +129,46 @@ def from_record(record: dict[str, Any]) -> Decision:
     return Decision(**values)
 
 
+@dataclass(frozen=True)
+class Turn:
+    """One message of a conversation after what was told first."""
+
+    role: Literal["model", "tool", "driver"]
+    """Who speaks; `driver` is RAPID, which asks for a decision."""
+    text: str
+
+
+def turns_of(turns: str) -> tuple[Turn, ...]:
+    """Return the `turns` of a decision; those that cannot be read are none."""
+    try:
+        messages = json.loads(turns or "[]")
+    except ValueError:
+        return ()
+    found: list[Turn] = []
+    for message in filter(lambda message: isinstance(message, dict), messages if isinstance(messages, list) else ()):
+        role, text = message.get("role"), str(message.get("content") or "")
+        calls = [call["function"] for call in message.get("tool_calls") or ()]
+        text = "\n".join(filter(None, [text, *(f"{call['name']} {call['arguments']}" for call in calls)]))
+        if role == "assistant":
+            found.append(Turn("model", text))
+        else:
+            found.append(Turn("tool" if role == "tool" or text.startswith("RESULT ") else "driver", text))
+    return tuple(found)
+
+
+def answer_in_words(decision: Decision) -> str:
+    """Return what a model answered, for people: one answer as it is, of a conversation its turns."""
+    turns = turns_of(decision.turns)
+    if len(turns) < 2:
+        return decision.answer
+    return "\n".join(f"{turn.role}: {turn.text}" for turn in turns)
+
+
+def computed_in_words(decision: Decision) -> str:
+    """Return what RAPID computed about an action, for people: also the reason that a rule gives, which is ours."""
+    return decision.computed or (decision.explanation if decision.status == "scripted" else "")
+
+
 def split_transcript(transcript: Any) -> tuple[str, str]:
     """Return what was told and the turns after it, of a transcript as decisions had it until version 0.1.
 
