@@ -40,11 +40,6 @@ def normalize(obs_BVF: Tensor, scale_F: Tensor) -> Tensor:
     return obs_BVF / scale_F
 
 
-def denormalize(normalized_BVF: Tensor, scale_F: Tensor) -> Tensor:
-    """Undo :func:`normalize`, up to the rounding of float32."""
-    return normalized_BVF * scale_F
-
-
 class Encoding(nn.Module):
     """Observation to features (B, V, F) and an attention mask.
 

@@ -40,7 +40,9 @@ CRASHES = {"RAPID": 2}
 def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
     """Drive the agents named and write rows, table and plot to `out`; `teacher` is the configured teacher."""
     check(config)
-    names = [str(_open(config, spec, config.scenario).name) for spec in specs]
+    # Opened once: a language model takes long to load, and as much memory again.
+    opened = {spec: _open(config, spec, config.scenario) for spec in specs}
+    names = [str(opened[spec].name) for spec in specs]
     # Two trainings of the same name would fall into one row of the table.
     labels = {spec: f"{name} ({spec})" for spec, name in zip(specs, names, strict=True) if names.count(name) > 1}
     files = [Path(spec) / "config.json" if Path(spec).is_dir() else Path(spec) for spec in specs]
@@ -57,7 +59,7 @@ def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]
             raise RapidError(f"'{out}' holds something else than this comparison. Choose another --out, or empty it.")
     else:
         write_json(out / "request.json", request)
-    rows = measure(config, config.scenario, specs, out, labels)
+    rows = measure(config, config.scenario, specs, out, labels, opened)
     write_figures(ReportData(title=f"{config.scenario}", rows=rows), out)
     return rows
 
@@ -89,11 +91,17 @@ def _open(config: Config, spec: str, scenario: str) -> Any:
 
 
 def measure(
-    config: Config, scenario: str, specs: Sequence[str], out: Path, labels: Mapping[str, str] | None = None
+    config: Config,
+    scenario: str,
+    specs: Sequence[str],
+    out: Path,
+    labels: Mapping[str, str] | None = None,
+    opened: Mapping[str, Any] | None = None,
 ) -> list[EpisodeRow]:
     """Drive every agent over the test spawns under every attack; an agent that is done is not driven again.
 
-    An empty name only takes a number. `labels` are names for agents whose own would not tell them apart.
+    An empty name only takes a number. `labels` are names for agents whose own would not tell them apart; `opened` are
+    agents that are open already.
     """
     rows: list[EpisodeRow] = []
     for number, spec in enumerate(specs):
@@ -101,7 +109,7 @@ def measure(
             continue
         part = out / "parts" / f"{number:02}.parquet"
         if not part.exists():
-            agent = _open(config, spec, scenario)
+            agent = opened[spec] if opened else _open(config, spec, scenario)
             if labels and spec in labels:
                 agent.name = labels[spec]
             episodes = _drive(config, scenario, spec, agent)

@@ -1,0 +1,27 @@
+"""Comparing agents: each is opened once."""
+
+from dataclasses import replace
+
+from rapid.config import TeacherConfig
+from rapid.phases import measure
+from rapid.presets import preset
+
+
+def test_a_teacher_is_opened_once(tmp_path, monkeypatch):
+    """A language model takes long to load."""
+    made, make = [], measure.make_teacher
+
+    def counted(config, *road):
+        made.append(config)
+        return make(config, *road)
+
+    monkeypatch.setattr(measure, "make_teacher", counted)
+    config = preset("strong", "tiny")
+    few = replace(config.evaluate, spawns=1, teacher_spawns=1, attacks=("none",))
+    config = replace(config, teacher=TeacherConfig(backend="scripted", model="rule"), evaluate=few)
+    rows = measure.compare(config, ["teacher", "slower"], tmp_path / "out")
+    assert len(rows) == 2
+    assert len(made) == 1
+    # And again, where nothing is driven.
+    assert measure.compare(config, ["teacher", "slower"], tmp_path / "out") == rows
+    assert len(made) == 2
