@@ -5,7 +5,7 @@ import json
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,11 +141,14 @@ class Turn:
 def turns_of(turns: str) -> tuple[Turn, ...]:
     """Return the `turns` of a decision; those that cannot be read are none."""
     try:
-        messages = json.loads(turns or "[]")
+        messages: Any = json.loads(turns or "[]")
     except ValueError:
         return ()
     found: list[Turn] = []
-    for message in filter(lambda message: isinstance(message, dict), messages if isinstance(messages, list) else ()):
+    for message in cast(list[Any], messages) if isinstance(messages, list) else ():
+        if not isinstance(message, dict):
+            continue
+        message = cast(dict[str, Any], message)
         role, text = message.get("role"), str(message.get("content") or "")
         calls = [call["function"] for call in message.get("tool_calls") or ()]
         text = "\n".join(filter(None, [text, *(f"{call['name']} {call['arguments']}" for call in calls)]))
