@@ -203,6 +203,9 @@ class _Listener:
     def commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> Sequence[Said]:
         return [(None, None)] * len(worlds)
 
+    def memory(self, worlds: NDArray[np.int64], count: int) -> NDArray[np.float32] | None:
+        return self._driver.memory(worlds, count)
+
     def ended(self, count: float) -> None:
         """Count an episode that ended, perhaps early."""
         self._finished += int(count)
