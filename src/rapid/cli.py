@@ -23,6 +23,7 @@ VERBS: dict[str, str] = {
     "report": "write the page of a run again",
     "reproduce": "every table and figure of the paper, obtained beside printed",
     "presets": "print what a recipe, a scale and a plan set, or where two differ",
+    "agents": "list the trained agents that come with the package",
     "models": "list, fetch, verify and remove the embedded language models",
     "verify-simulator": "hold the compiled simulator against highway-env, step by step",
     "doctor": "check this machine and say what to do about each failure",

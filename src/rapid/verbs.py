@@ -179,8 +179,8 @@ class Evaluate:
     """Directories of agents, ONNX files, and drivers by name: slower, idle, faster, random, rule, rule-forecast,
     rule-foresight, uniform-safe, planner, planner-cars, planner-observation, teacher (the one of --config)."""
     evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
-    scenario: str = Config.scenario
-    """Where they drive."""
+    scenario: str = ""
+    """Where they drive; by default where the saved agents were trained, else in lane-3-density-2."""
     simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
     """The compiled twin, or highway-env itself."""
     out: str = "evaluation"
@@ -276,6 +276,16 @@ class Presets:
     """Such as strong, strong/full or strong/full/ppo; nothing lists what there is."""
     second: Annotated[Positional[str], arg(metavar="RECIPE[/SCALE[/PLAN]]")] = ""
     """What the first is compared with."""
+
+
+@dataclass(frozen=True)
+class Agents:
+    """List the trained agents that come with the package, or show the card of one."""
+
+    action: Annotated[Positional[str], arg(metavar="ACTION")] = "list"
+    """list, or show."""
+    name: Annotated[Positional[str], arg(metavar="NAME")] = ""
+    """Such as lane-3-density-2/rapid; not needed to list."""
 
 
 @dataclass(frozen=True)
@@ -390,6 +400,10 @@ def _with_options(base: Config, options: Any) -> Config:
     """`base` with the sections and values that a verb's options carry."""
     if isinstance(options, Run):
         return validate(options.settings)
+    if isinstance(options, Evaluate) and not options.scenario:
+        from rapid.agents.open import own_scenario
+
+        options = dataclasses.replace(options, scenario=own_scenario(options.agents) or base.scenario)
     names = {item.name for item in dataclasses.fields(options)} & {item.name for item in dataclasses.fields(Config)}
     config = dataclasses.replace(base, **{name: getattr(options, name) for name in names})
     curve_spawns = getattr(options, "curve_spawns", None)
@@ -609,6 +623,18 @@ def _presets(options: Presets, config: Config) -> int:
     return 0
 
 
+def _agents(options: Agents, config: Config) -> int:
+    from rapid.agents.shipped import card, listing
+
+    if options.action == "list":
+        print(listing())
+        return 0
+    if options.action != "show":
+        raise RapidError(f"'{options.action}' is nothing to do with agents. Say list, or show NAME.")
+    print(json.dumps(card(options.name.removeprefix("shipped:")), indent=2))
+    return 0
+
+
 def _models(options: Models, config: Config) -> int:
     from rapid.teacher import models
 
@@ -662,6 +688,7 @@ _VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "report": (Report, _report),
     "reproduce": (Reproduce, _reproduce),
     "presets": (Presets, _presets),
+    "agents": (Agents, _agents),
     "models": (Models, _models),
     "verify-simulator": (VerifySimulator, _verify),
     "doctor": (Doctor, _doctor),

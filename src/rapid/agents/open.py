@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 import rapid
 from rapid.agents.saved import remembers
+from rapid.agents.shipped import agent_folder
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import Kind
+from rapid.files import read_json
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision
@@ -71,6 +73,25 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
         f"`rapid distill` or `rapid adapt` wrote, an ONNX file, a scripted driver "
         f"({', '.join(SCRIPTED)}), or a planner ({', '.join(PLANNERS)})."
     )
+
+
+def own_scenario(specs: Sequence[str]) -> str:
+    """Return the scenario in which the saved agents among `specs` were trained; empty if none of them is saved.
+
+    Raises:
+        RapidError: they were trained in different ones.
+    """
+    found: dict[str, str] = {}
+    for spec in specs:
+        path = agent_folder(spec) / "config.json"
+        if path.is_file():
+            metadata = read_json(path, "agent").get("metadata", {})
+            if isinstance(metadata, dict) and isinstance(metadata.get("scenario"), str):
+                found.setdefault(metadata["scenario"], spec)
+    if len(found) > 1:
+        told = ", ".join(f"'{spec}' in {scenario}" for scenario, spec in found.items())
+        raise RapidError(f"These agents were trained in different scenarios: {told}. Say where with --scenario.")
+    return next(iter(found), "")
 
 
 def check_road(agent: Any, scenario: str) -> None:

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from rapid import files
+from rapid.agents.shipped import agent_folder
 from rapid.config import NetworkConfig
 from rapid.config_io import apply_overrides
 from rapid.errors import RapidError
@@ -199,12 +200,14 @@ def save_agent(directory: str | os.PathLike[str], network: QNetwork, metadata: d
 
 
 def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent:
-    """Read an agent that :func:`save_agent` wrote; it is called after its directory unless its metadata has a `name`.
+    """Read an agent that :func:`save_agent` wrote, or one that is shipped (``shipped:lane-3-density-2/rapid``).
+
+    It is called after its directory unless its metadata has a `name`.
 
     Raises:
         RapidError: there is no agent, or it is damaged, of another version, or does not fit this program.
     """
-    folder = Path(directory)
+    folder = agent_folder(directory)
     config = files.read_json(folder / CONFIG_FILE, "agent")
     if not isinstance(config, dict) or config.get("format") != FORMAT:
         raise RapidError(f"'{folder / CONFIG_FILE}' does not describe an agent. Give the directory of a saved agent.")
