@@ -62,7 +62,7 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
         if spec == "planner":
             return PlannerAgent()
         return CarsPlanner(seed=seed) if spec == "planner-cars" else ObservationPlanner(scenario, seed=seed)
-    if Path(spec).is_dir():
+    if is_shipped(spec) or Path(spec).is_dir():
         return rapid.load_agent(spec, device)
     if Path(spec).suffix == ".onnx":
         from rapid.agents.onnx import OnnxAgent

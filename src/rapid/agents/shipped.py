@@ -1,7 +1,7 @@
 """The trained agents that come with the package; ``shipped:SCENARIO/NAME`` stands for one wherever an agent is expected.
 
-Each is a directory as `save_agent` writes it, with ``card.json`` (what it is, how it was made, what it scores, its
-limits and the hash of its weights) and, where its network can be exported, ``agent.onnx``.
+Each is a directory as `save_agent` writes it, with ``card.json`` (what it is, how it was made, what it scores,
+its limits and the hash of its weights) and, where its network can be exported, ``agent.onnx``.
 """
 
 import os
@@ -10,7 +10,6 @@ from typing import Any
 
 from rapid.data.shipped import SHIPPED
 from rapid.errors import RapidError, did_you_mean
-from rapid.evaluation.summary import aligned
 from rapid.files import read_json
 
 _FOLDER = Path(__file__).resolve().parents[1] / SHIPPED
@@ -61,6 +60,8 @@ def card(name: str) -> dict[str, Any]:
 
 def listing() -> str:
     """Return every shipped agent with what it is and what it scores, as a table."""
+    from rapid.evaluation.summary import aligned  # with what it needs: only who asks for the table waits for it
+
     lines = [["agent", "return", "crash share", "worst of the paper's attacks", "what it is"]]
     for name in shipped_agents():
         about = card(name)

@@ -1,0 +1,116 @@
+"""Measures a trained agent over the test spawns, clean and under the paper's attacks, and puts it into the package.
+
+The agent's directory is copied to ``src/rapid/shipped/SCENARIO/agents/NAME`` with its card and, where its network can be
+exported, its ONNX file.
+
+    python benchmarks/ship_agents.py runs/adapt/agent rapid "Best clean return: 300,000 steps by Q-learning, 700,000 by PPO"
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rapid.agents.onnx import driven_observations, export_onnx
+from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent
+from rapid.agents.shipped import CARD_FILE, ONNX_FILE
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
+from rapid.evaluation.rollouts import evaluate_agent
+from rapid.evaluation.statistics import estimate
+from rapid.files import read_json, sha256, write_bytes, write_json
+from rapid.progress import task
+from rapid.runs import commit
+from rapid.spawns import spawn_seeds
+
+ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
+PACKAGE = Path(__file__).resolve().parents[1] / "src" / "rapid" / "shipped"
+SIZES = "Attacks are the paper's: noise of 0.2, gradients of 0.1 in normalised features (20 m along the road)."
+LIMITS = (
+    "It drives HighwayEnv's straight highway in the scenario named, and nothing else. It is no driver of real cars. "
+    "Stronger attacks than those measured may fool it."
+)
+
+
+def scores(rows: list[EpisodeRow]) -> dict[str, Any]:
+    """Return mean return with its interval and crash share under each attack, and the worst attack."""
+    found: dict[str, Any] = {}
+    for attack in ATTACKS:
+        here = [row for row in rows if row.attack == attack]
+        if not here:
+            continue
+        returns = estimate(column(here, "episode_return"), [row.seed for row in here])
+        found[attack] = {
+            "return": round(returns.value, 2),
+            "interval": [round(returns.low, 2), round(returns.high, 2)],
+            "crash_share": round(float(np.mean(column(here, "crashed"))), 3),
+            "episodes": len(here),
+        }
+    worst = min((attack for attack in found if attack != "none"), key=lambda name: found[name]["return"])
+    return found | {"worst": {"attack": worst, **found[worst]}}
+
+
+def main() -> None:
+    """Measure one agent and write its directory."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("agent", type=Path, help="directory of the trained agent")
+    parser.add_argument("name", help="its name in the package")
+    parser.add_argument("summary", help="one sentence: what it is")
+    parser.add_argument("--scenario", default="", help="by default the one that it was trained in")
+    parser.add_argument("--spawns", type=int, default=200, help="test spawns")
+    parser.add_argument("--work", type=Path, default=Path("runs/ship"), help="where the rows are kept")
+    chosen = parser.parse_args()
+    agent = load_agent(chosen.agent)
+    scenario = chosen.scenario or str(agent.metadata["scenario"])
+    rows: list[EpisodeRow] = []
+    seeds = spawn_seeds("test", chosen.spawns)
+    with task(f"{scenario}/{chosen.name}", len(seeds) * len(ATTACKS), "episodes") as work:
+        for attack in ATTACKS:
+            part = chosen.work / f"{scenario}-{chosen.name}-{attack}.parquet"
+            if not part.exists():
+                seed = agent.metadata.get("seed")
+                save_rows(
+                    part,
+                    evaluate_agent(
+                        agent,
+                        scenario,
+                        seeds,
+                        (attack,),
+                        training_seed=seed if isinstance(seed, int) else None,
+                        commit=commit(),
+                        progress=work.advance,
+                    ),
+                )
+            rows += load_rows(part)
+    home = PACKAGE / scenario.replace(":", "-") / "agents" / chosen.name
+    for file in (CONFIG_FILE, WEIGHTS_FILE):
+        write_bytes(home / file, (chosen.agent / file).read_bytes())
+    shipped = load_agent(home)
+    try:
+        parity = export_onnx(shipped, home / ONNX_FILE, driven_observations(shipped, scenario, seeds[:4]))
+        onnx: Any = {"sha256": sha256(home / ONNX_FILE), "largest_difference": float(f"{parity.difference:.2g}")}
+    except RapidError as error:
+        onnx = str(error)
+    write_json(
+        home / CARD_FILE,
+        {
+            "name": f"shipped:{home.parents[1].name}/{chosen.name}",
+            "summary": chosen.summary,
+            "scenario": scenario,
+            "seed": agent.metadata.get("seed"),
+            "phase": agent.metadata.get("phase"),
+            "scores": scores(rows),
+            "scores_are": f"One training over {chosen.spawns} test spawns. {SIZES}",
+            "weights_sha256": read_json(home / CONFIG_FILE, "agent")["weights_sha256"],
+            "onnx": onnx,
+            "commit": commit(),
+            "licence": "Apache-2.0",
+            "limits": LIMITS,
+        },
+    )
+    print(f"{home}: {sum(path.stat().st_size for path in home.iterdir()) / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
