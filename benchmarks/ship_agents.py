@@ -1,9 +1,9 @@
 """Measures a trained agent over the test spawns, clean and under the paper's attacks, and puts it into the package.
 
-The agent's directory is copied to ``src/rapid/shipped/SCENARIO/agents/NAME`` with its card and, where its network can be
-exported, its ONNX file.
+The agent's directory is copied to ``src/rapid/shipped/SCENARIO/agents/NAME`` with its card and, where its network can
+be exported, its ONNX file.
 
-    python benchmarks/ship_agents.py runs/adapt/agent rapid "Best clean return: 300,000 steps by Q-learning, 700,000 by PPO"
+    python benchmarks/ship_agents.py runs/adapted/agent rapid "Best clean return: 300,000 steps, then 700,000 by PPO"
 """
 
 import argparse
