@@ -15,8 +15,8 @@ from rapid.bounds import Bounds, numbers
 from rapid.config import Config
 from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate
 from rapid.errors import RapidError
+from rapid.parsing import base_settings
 from rapid.presets import preset
-from rapid.verbs import _base_settings
 
 PRESETS = [(recipe, scale) for recipe in settings.RECIPES for scale in settings.SCALES]
 
@@ -100,9 +100,9 @@ def test_a_file_that_contradicts_an_option_is_told(tmp_path: Path):
     file = tmp_path / "old.toml"
     file.write_text(to_toml(to_dict(preset("strong", "quick"))))
     with pytest.raises(RapidError, match=r"of the scale 'quick', and --scale says 'tiny'"):
-        _base_settings(["--config", str(file), "--scale", "tiny"])
+        base_settings(["--config", str(file), "--scale", "tiny"])
     file.write_text("[mix]\nsize = 50\n")
-    assert _base_settings(["--config", str(file), "--scale", "tiny"]).mix.size == 50
+    assert base_settings(["--config", str(file), "--scale", "tiny"]).mix.size == 50
 
 
 def test_every_field_has_a_docstring():
@@ -213,14 +213,14 @@ def test_the_tree_is_frozen():
 
 
 def test_every_number_has_bounds_and_the_defaults_lie_within():
-    from rapid.verbs import _VERBS
+    from rapid.verbs import VERBS
 
     def bare(settings: Any) -> list[str]:
         return [name for name, number, bounds in numbers(settings) if bounds is None or not bounds.hold(number)]
 
     assert len(list(numbers(Config()))) > 70
     assert bare(Config()) == []
-    for kind, _ in _VERBS.values():
+    for kind, _ in VERBS.values():
         given = [item.name for item in dataclasses.fields(kind) if item.default is dataclasses.MISSING]
         required = [
             name

@@ -1,0 +1,309 @@
+"""What each verb of the command line can be told: one dataclass for each, a docstring at each option.
+
+Options are fields of the settings tree (:mod:`rapid.config`), or stand beside it. This module imports nothing heavy.
+"""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, TypeVar
+
+from tyro.conf import Positional, arg
+
+from rapid.bounds import Count, Positive, Seed
+from rapid.config import (
+    AdaptConfig,
+    CollectConfig,
+    Config,
+    DistillConfig,
+    EvaluateConfig,
+    MixConfig,
+    NetworkConfig,
+    Plan,
+    Recipe,
+    Scale,
+    TeacherConfig,
+)
+from rapid.scenarios import PAPER_SCENARIOS, Reward
+from rapid.tracking import Tracking
+
+T = TypeVar("T")
+
+# A section of the tree whose options stand at the top level: `--p`, not `--mix.p`.
+Flat = Annotated[T, arg(name="")]
+SettingsFile = Annotated[str, arg(name="config", metavar="FILE.toml")]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the defaults of a verb's settings come from."""
+
+    recipe: Recipe = Config.recipe
+    """Defaults of the settings."""
+    scale: Scale = Config.scale
+    """Defaults of the sizes."""
+    plan: Plan = Config.plan
+    """Defaults of phase 3."""
+    file: SettingsFile = ""
+    """Settings in a TOML file; options override it, it overrides recipe and scale."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Do everything, in one directory: collect, mix, distill, adapt, evaluate, report.
+
+    The same command goes on after an interruption.
+    """
+
+    settings: Flat[Config] = field(default_factory=Config)
+    file: SettingsFile = ""
+    """Settings in a TOML file; options override it, it overrides recipe and scale."""
+    directory: str = ""
+    """Where the run lives; by default runs/SCENARIO-RECIPE-SCALE-seedN, with a hash of other settings behind it."""
+    restart: Annotated[str, arg(name="from", metavar="STEP")] = ""
+    """Redo this step and all later ones: collect, mix, distill, adapt, evaluate or report."""
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Let a teacher drive and keep every step as an offline dataset.
+
+    The same command goes on after an interruption, and with a larger budget or more transitions. --workers n divides
+    the work among n processes, or with --engine ray among the machines of a Ray cluster. With --teacher.backend
+    scripted --teacher.model random it makes the random data of a mixture, of --random-transitions transitions.
+    """
+
+    collect: Flat[CollectConfig] = field(default_factory=CollectConfig)
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    out: str = "data/teacher"
+    """Directory of the dataset."""
+    scenario: str = Config.scenario
+    """Where the teacher drives."""
+    seed: Seed = Config.seed
+    """Decides the random driver's actions; the traffic is fixed by the spawn seeds."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Relabel:
+    """Give a collected dataset the scenario's other reward: its episodes are driven again, action by action."""
+
+    dataset: Annotated[Positional[str], arg(metavar="DATASET")]
+    """Directory of the dataset as it was collected, or a shipped set such as shipped:lane-3-density-2/teacher."""
+    reward: Reward = "progress"
+    """The reward that is wanted; `progress` counts distance and not crashing alone."""
+    out: str = "data/relabelled"
+    """Directory of the dataset with these rewards."""
+
+
+@dataclass(frozen=True)
+class Mix:
+    """Mix a teacher's and a random dataset into one, transition by transition."""
+
+    teacher_data: Annotated[Positional[str], arg(metavar="TEACHER_DATA")]
+    """Directory of the teacher's dataset."""
+    random_data: Annotated[Positional[str], arg(metavar="RANDOM_DATA")]
+    """Directory of the random dataset."""
+    mix: Flat[MixConfig] = field(default_factory=MixConfig)
+    out: str = "data/mixed"
+    """Directory of the mixture."""
+    seed: Seed = Config.seed
+    """Decides which transitions are drawn."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Distill:
+    """Phase 2: train a policy offline on a dataset, with the robust term."""
+
+    dataset: Annotated[Positional[str], arg(metavar="DATASET")]
+    """Directory of the dataset."""
+    distill: Flat[DistillConfig] = field(default_factory=DistillConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    out: str = "distilled"
+    """Directory of the agent and its training record."""
+    curve_spawns: Count = EvaluateConfig.curve_spawns
+    """Episodes of each point of the learning curve."""
+    tracking: Tracking = Config.tracking
+    """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""
+    seed: Seed = Config.seed
+    """Decides the weights, the batches and the inner attack."""
+    seeds: Positive = 1
+    """Train this many agents, of the seeds from --seed on, into OUT/seed-N. Baselines (kind mlp, neither robust nor
+    Munchausen term) train together as one stack in less than half the time, with one record for all in OUT/together;
+    others one after another, where a process for each seed is faster."""
+    device: str = Config.device
+    """Torch device; on a CUDA device a gradient step is recorded once and replayed."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Adapt:
+    """Phase 3: let an agent learn online in the target scenario, its distilled policy frozen."""
+
+    agent: Annotated[Positional[str], arg(metavar="AGENT")]
+    """Directory of the agent."""
+    adapt: Flat[AdaptConfig] = field(default_factory=AdaptConfig)
+    dataset: str = ""
+    """Offline dataset: for --offline-share, which is 0 without it, and to measure what is forgotten."""
+    out: str = "adapted"
+    """Directory of the adapted agent and its training record."""
+    curve_spawns: Count = EvaluateConfig.curve_spawns
+    """Episodes of each point of the learning curve."""
+    tracking: Tracking = Config.tracking
+    """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""
+    seed: Seed = Config.seed
+    """Decides the traffic, the exploration and the batches."""
+    device: str = Config.device
+    """Torch device; on a CUDA device a gradient step of Q-learning is recorded once and replayed."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare agents over the same fixed spawns, clean and under attacks, in one table and one plot."""
+
+    agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
+    """Directories of agents, ONNX files, and drivers by name: slower, idle, faster, random, rule, rule-forecast,
+    rule-foresight, uniform-safe, planner, planner-cars, planner-observation, teacher (the one of --config)."""
+    evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
+    scenario: str = ""
+    """Where they drive; by default where the saved agents were trained, else in lane-3-density-2."""
+    simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
+    """The compiled twin, or highway-env itself."""
+    out: str = "evaluation"
+    """Directory of the episodes, the table and the plot."""
+    seed: Seed = Config.seed
+    """Decides the noise of attacks and the random driver; the traffic is fixed by the spawn seeds."""
+    source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class TeachBench:
+    """Compare teachers, models and prompt styles on the same spawns: what each is worth, what each costs.
+
+    The same command goes on after an interruption; with one more teacher it drives that one only.
+    """
+
+    teachers: Annotated[Positional[tuple[str, ...]], arg(metavar="TEACHER ...")]
+    """Scripted drivers (rule, rule-forecast, slower, random, ..., planner), embedded models with a style
+    (smollm2-135m:digest, smollm2-135m:react, and as a control smollm2-135m:digest:shuffled), or TOML files with a
+    [teacher] section, for servers and recordings. The others are compared with the first."""
+    scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = PAPER_SCENARIOS
+    """Where they drive; by default the paper's three."""
+    spawns: Positive = 32
+    """Episodes of each teacher in each scenario."""
+    spawn_set: Literal["tune", "test"] = "tune"
+    """Where the spawn seeds come from: `tune` to choose a teacher, `test` to report one that was chosen elsewhere."""
+    lockstep: Positive = 64
+    """Episodes driven side by side: a `local` model answers all of them together."""
+    out: str = "teach-bench"
+    """Directory of the rows, the table and the plot."""
+    simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
+    """The compiled twin, or highway-env itself."""
+    seed: Seed = Config.seed
+    """Decides the random drivers and the shuffled facts; the traffic is fixed by the spawn seeds."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write an agent as ONNX, compare the two on real observations, and time a decision."""
+
+    agent: Annotated[Positional[str], arg(metavar="AGENT")]
+    """Directory of the agent."""
+    out: str = ""
+    """The file; by default AGENT.onnx, beside the agent's directory."""
+    dataset: str = ""
+    """Dataset whose observations are compared; without it, those that the agent meets on 32 test spawns."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write the page of a run again."""
+
+    directory: Annotated[Positional[str], arg(metavar="DIRECTORY")]
+    """Directory of the run."""
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Compute tables and figures of the paper and ours, beside what the paper prints; without an id list them.
+
+    The same command goes on after an interruption; what is done is never computed again.
+    """
+
+    ids: Annotated[Positional[tuple[str, ...]], arg(metavar="ID ...")] = ()
+    """Such as attack, offline or ratio; `all` is every one."""
+    recipe: Recipe = "paper"
+    """How things are trained."""
+    scale: Scale = Config.scale
+    """How much is run: tiny (minutes), quick, full (five trainings, 200 spawns)."""
+    engine: Annotated[str, arg(metavar="{local,ray}")] = CollectConfig.engine
+    """Where parts are computed."""
+    workers: Positive = 1
+    """Parts under way at once."""
+    store: str = "runs/store"
+    """Directory of finished parts."""
+    layers: tuple[str, ...] = ()
+    """Directories of small results that are only read; results/cells is one wherever it is there."""
+    out: str = ""
+    """Directory of the page; by default runs/reproduce/RECIPE-SCALE."""
+    export: str = ""
+    """Also write the small results to this directory, as a layer for other checkouts."""
+    dry_run: bool = False
+    """Only say what is done and what is to do."""
+    page_only: bool = False
+    """Compute nothing: write the page of what is there."""
+
+
+@dataclass(frozen=True)
+class Presets:
+    """Print what a recipe, a scale and a plan set; with a second one, only where the two differ."""
+
+    first: Annotated[Positional[str], arg(metavar="RECIPE[/SCALE[/PLAN]]")] = ""
+    """Such as strong, strong/full or strong/full/ppo; nothing lists what there is."""
+    second: Annotated[Positional[str], arg(metavar="RECIPE[/SCALE[/PLAN]]")] = ""
+    """What the first is compared with."""
+
+
+@dataclass(frozen=True)
+class Agents:
+    """List the trained agents that come with the package, or show the card of one."""
+
+    action: Annotated[Positional[str], arg(metavar="ACTION")] = "list"
+    """list, or show."""
+    name: Annotated[Positional[str], arg(metavar="NAME")] = ""
+    """Such as lane-3-density-2/rapid; not needed to list."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """List the embedded language models, fetch one, verify it, or remove it."""
+
+    action: Annotated[Positional[str], arg(metavar="ACTION")] = "list"
+    """list, pull, verify or remove."""
+    name: Annotated[Positional[str], arg(metavar="NAME")] = ""
+    """The model; not needed to list."""
+
+
+@dataclass(frozen=True)
+class VerifySimulator:
+    """Hold the compiled simulator against the installed highway-env, step by step, and give a verdict."""
+
+    episodes: Positive = 12
+    """Episodes in all, shared among the scenarios."""
+    scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = ()
+    """Scenarios or HighwayEnv's ids; by default the paper's with both dynamics, HighwayEnv's own, and others that reach
+    the rest of the configuration; then the time limits at many frequencies are compared too."""
+    processes: Positive = 1
+    """Processes that drive highway-env, which takes nearly all of the time."""
+    plain_math: bool = True
+    """Let NumPy use the C library's functions under highway-env, so that states can be compared to the last bit.
+    Without it, on a processor with AVX-512, highway-env differs from itself elsewhere, visibly so after crashes."""
+    out: str = ""
+    """Also write the verdict to this file."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check Python, torch, the simulator's speed, the cache, the model and the endpoint."""
+
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
