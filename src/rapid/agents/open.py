@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import rapid
 from rapid.agents.saved import remembers
-from rapid.agents.shipped import agent_folder
+from rapid.agents.shipped import agent_folder, is_shipped
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import Kind
 from rapid.files import read_json

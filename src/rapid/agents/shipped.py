@@ -1,4 +1,4 @@
-"""The trained agents that come with the package; ``shipped:SCENARIO/NAME`` stands for one wherever an agent is expected.
+"""The trained agents that come with the package: ``shipped:SCENARIO/NAME`` is one, wherever an agent is expected.
 
 Each is a directory as `save_agent` writes it, with ``card.json`` (what it is, how it was made, what it scores,
 its limits and the hash of its weights) and, where its network can be exported, ``agent.onnx``.
