@@ -15,7 +15,7 @@ from rapid.scenarios import MAX_VEHICLES, MIN_VEHICLES, NUM_VEHICLES
 
 Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full"]
-Plan = Literal["printed", "careful", "bold", "ppo"]
+Plan = Literal["printed", "careful", "bold", "ppo", "robust"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
 PLANS: tuple[str, ...] = typing.get_args(Plan)

@@ -62,10 +62,11 @@ STEPS: dict[Plan, dict[Scale, tuple[int, int]]] = {
     "careful": {"tiny": (200, 0), "quick": (10_000, 0), "full": (10_000, 0)},
     "bold": {"tiny": (200, 0), "quick": (30_000, 0), "full": (100_000, 0)},
     "ppo": {"tiny": (200, 7_680), "quick": (30_000, 115_200), "full": (300_000, 700_000)},
+    "robust": {"tiny": (0, 7_680), "quick": (0, 153_600), "full": (0, 600_000)},
 }
 """Environment steps of phase 3, by Q-learning and then by PPO."""
 DEFAULT_PLAN: dict[Recipe, Plan] = {"paper": "printed", "strong": "bold"}
-OF_RECIPE: dict[Recipe, tuple[Plan, ...]] = {"paper": ("printed",), "strong": ("careful", "bold", "ppo")}
+OF_RECIPE: dict[Recipe, tuple[Plan, ...]] = {"paper": ("printed",), "strong": ("careful", "bold", "ppo", "robust")}
 
 
 def preset(recipe: str = "strong", scale: str = "quick", plan: str = "") -> Config:
@@ -220,11 +221,26 @@ def _as_it_is(adapt: AdaptConfig) -> AdaptConfig:
     return adapt
 
 
+def _under_attack(adapt: AdaptConfig) -> AdaptConfig:
+    """Return phase 3 by PPO alone, with a memory, first without attacks and then under a mixture of them.
+
+    The memory lets it plan by what no attack moves, and what pays is learned before attacks drown it (docs/log.md).
+    """
+    return replace(
+        adapt,
+        train="all",
+        memory=True,
+        ppo=replace(adapt.ppo, learning_rate=5e-4, entropy=0.003, critic_steps=20_000),
+        adversary=replace(adapt.adversary, gradient_share=0.65, noise_share=0.1, begin=0.35, ramp=0.15),
+    )
+
+
 _PLANS: dict[Plan, Callable[[AdaptConfig], AdaptConfig]] = {
     "printed": _as_it_is,
     "careful": _as_it_is,
     "bold": _boldly,
     "ppo": _far_sighted,
+    "robust": _under_attack,
 }
 
 OfflineBaseline = Literal["dqn", "ddqn", "cql", "bc"]

@@ -196,11 +196,11 @@ def _export(options: Export, config: Config) -> int:
     out = options.out or f"{folder.resolve()}.onnx"
     if options.dataset:
         obs_NVF = load_dataset(options.dataset).transitions.obs_NVF
-        obs_BVF = with_rows(torch.from_numpy(obs_NVF), agent.vehicles).numpy()
+        obs_BVF, state_BS = with_rows(torch.from_numpy(obs_NVF), agent.vehicles).numpy(), None
     else:
         scenario = str(agent.metadata.get("scenario") or config.scenario)
-        obs_BVF = driven_observations(agent, scenario, spawn_seeds("test", 32))
-    parity = export_onnx(agent, out, obs_BVF)
+        obs_BVF, state_BS = driven_observations(agent, scenario, spawn_seeds("test", 32))
+    parity = export_onnx(agent, out, obs_BVF, state_BS)
     print(
         f"{out}\n{parity.observations} observations: largest difference of Q-values {parity.difference:.2g}, "
         f"the same action on {parity.agreement:.2%}\n"

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from rapid.agents.onnx import OnnxAgent, export_onnx, latency
+from rapid.agents.onnx import OnnxAgent, driven_observations, export_onnx, latency
 from rapid.agents.saved import QAgent, save_agent
 from rapid.cli import main
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
+from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.q_network import build_network
 
 pytest.importorskip("onnxruntime")
@@ -116,7 +117,7 @@ def test_the_check_needs_observations(roads, tmp_path):
 def test_a_model_that_differs_is_not_written(roads, tmp_path, monkeypatch):
     agent = make(kind="mlp")
     original = agent.q_values
-    monkeypatch.setattr(agent, "q_values", lambda obs: original(obs) + 1)
+    monkeypatch.setattr(agent, "q_values", lambda obs, state=None: original(obs) + 1)
     with pytest.raises(RapidError, match="was not written"):
         export_onnx(agent, tmp_path / "x.onnx", roads(3).numpy())
     assert not list(tmp_path.iterdir())
@@ -167,3 +168,41 @@ def test_missing_files_and_packages_are_explained(roads, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(RapidError, match=r"rapid-driving\[export\]"):
         OnnxAgent(tmp_path / "bad.onnx")
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"kind": "attentive"}, {"action_token": "ego", "gate": "tanh"}, {"num_policies": 3}]
+)
+def test_a_memory_is_exported_with_the_agent(settings, tmp_path):
+    agent = opened(make(memory=True, **settings))
+    with torch.no_grad():
+        agent.network.memory.out.weight.normal_(0, 0.5, generator=torch.Generator().manual_seed(1))
+    seeds = list(range(900_000, 900_012))
+    obs, state = driven_observations(agent, "lane-3-density-2", seeds)
+    # As if it were attacked: what is believed of the ego is bounded in the model as well.
+    obs[::2, 0, 1:4] += np.array([20, 1, -8], np.float32)
+    path = tmp_path / "it.onnx"
+    parity = export_onnx(agent, path, obs, state)
+    assert parity.observations == len(obs) > 24
+    assert parity.agreement > 0.99
+    exported = OnnxAgent(path)
+    assert exported.has_memory
+    np.testing.assert_array_equal(exported.start(2), agent.start(2))
+    np.testing.assert_allclose(exported.q_values(obs, state), agent.q_values(obs, state), atol=1e-4)
+    # Whoever drives with the model alone gets the same state from it.
+    following = exported.session.run(["next_state"], exported.inputs(obs, state))[0]
+    np.testing.assert_allclose(following, agent.remember(state, exported.act(obs, state)), atol=2e-4)
+    mine, theirs = (run_episodes(each, "lane-3-density-2", seeds) for each in (agent, exported))
+    np.testing.assert_allclose(mine.return_E, theirs.return_E)
+    with pytest.raises(RapidError, match=r"has a memory and needs state beside the observations: agent\.start"):
+        exported.act(obs)
+    assert latency(path, obs[0], calls=5) > 0
+
+
+def test_who_has_no_memory_takes_no_state(roads, tmp_path):
+    agent, obs = make(), roads(2).numpy()
+    export_onnx(agent, tmp_path / "it.onnx", obs)
+    exported = OnnxAgent(tmp_path / "it.onnx")
+    assert not exported.has_memory
+    with pytest.raises(RapidError, match="has no memory and takes no state"):
+        exported.act(obs, exported.start(2))

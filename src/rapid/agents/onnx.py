@@ -1,6 +1,8 @@
 """Agents as ONNX: one file that any ONNX runtime drives with, no RAPID and no torch needed.
 
-The model reads `obs` (batch, V, 5), float32, raw as the environment gives it, and returns `q` (batch, 5).
+The model reads `obs` (batch, V, 5), float32, raw as the environment gives it, and returns `q` (batch, 5). That of an
+agent with a memory also reads `state` (batch, 6) and returns `next_state`, which is given back at the next step; an
+episode begins with [0, 6, 25, 0, lanes - 1, 0] (:mod:`rapid.networks.memory`).
 """
 
 import json
@@ -16,9 +18,12 @@ from rapid import files
 from rapid.agents.onnx_graph import build_model
 from rapid.agents.saved import QAgent, check_observations
 from rapid.errors import RapidError
+from rapid.networks.memory import initial_state, next_state
 from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, MIN_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
 
 METADATA_KEY = "rapid"
+STATE = "state"
+"""The input of a model with a memory beside the observations."""
 TOLERANCE = 1e-4
 """Largest difference allowed between the Q-values of the exported model and the network, relative to their size."""
 
@@ -28,7 +33,9 @@ class OnnxAgent:
 
     Args:
         path: the model, made by :func:`export_onnx` or by anyone: its one input takes observations (batch, V, 5),
-            flattened or not, and its first output gives Q-values (batch, 5).
+            flattened or not, and its first output gives Q-values (batch, 5). Where :func:`export_onnx` has given it a
+            memory, it has `state` (batch, S) and `next_state` as well, and is driven as a
+            :class:`~rapid.agents.saved.RememberingAgent`.
         name: the name shown in tables; the file's by default.
 
     Raises:
@@ -53,7 +60,11 @@ class OnnxAgent:
         shape = list(inputs[0].shape)
         sizes = range(MIN_VEHICLES, MAX_VEHICLES + 1)
         found = [size for size in sizes if shape[1:] in ([size, NUM_FEATURES], [size * NUM_FEATURES])]
-        if len(inputs) != 1 or not found:
+        self.metadata: dict[str, Any] = json.loads(
+            self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
+        )
+        self.has_memory = bool(self.metadata.get("memory"))
+        if [item.name for item in inputs[1:]] != [STATE] * self.has_memory or not found:
             raise RapidError(
                 f"The ONNX model '{path}' reads {[(item.name, item.shape) for item in inputs]}, but an agent reads one "
                 f"input of shape (batch, {NUM_VEHICLES}, {NUM_FEATURES}) or (batch, {NUM_VEHICLES * NUM_FEATURES}), or "
@@ -67,32 +78,50 @@ class OnnxAgent:
             )
         self.flat = len(shape) == 2
         self.name = name or Path(path).stem
-        self.metadata: dict[str, Any] = json.loads(
-            self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
-        )
 
     @property
     def mirrored_lanes(self) -> int | None:
         """On roads with how many lanes left is as good as right to it; None where it tells them apart."""
         return self.metadata.get("mirrored_lanes")
 
-    def act(self, obs_BVF: np.ndarray) -> np.ndarray:
+    def start(self, worlds: int) -> np.ndarray:
+        """Return the states (B, S), float32, with which episodes begin."""
+        return initial_state(worlds, int(self.metadata["lanes"]))
+
+    def remember(self, state_BS: np.ndarray, action_B: np.ndarray) -> np.ndarray:
+        """Return the states (B, S) after these actions."""
+        return next_state(state_BS, action_B, int(self.metadata["lanes"]))
+
+    def act(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> np.ndarray:
         """Return the greedy actions (B,), int64.
 
         Raises:
-            RapidError: the observations have the wrong shape or are not finite.
+            RapidError: the observations have the wrong shape or are not finite, or a state is missing or too much.
         """
-        return self.q_values(obs_BVF).argmax(1)
+        return self.q_values(obs_BVF, state_BS).argmax(1)
 
-    def q_values(self, obs_BVF: np.ndarray) -> np.ndarray:
+    def q_values(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> np.ndarray:
         """Return the Q-values (B, A), float32.
 
         Raises:
-            RapidError: the observations have the wrong shape or are not finite.
+            RapidError: the observations have the wrong shape or are not finite, or a state is missing or too much.
+        """
+        return np.asarray(self.session.run([self.output], self.inputs(obs_BVF, state_BS))[0])
+
+    def inputs(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Return what the model reads, by the names of its inputs.
+
+        Raises:
+            RapidError: the observations have the wrong shape or are not finite, or a state is missing or too much.
         """
         obs_BVF = check_observations(obs_BVF, self.name, self.vehicles)
-        values = obs_BVF.reshape(len(obs_BVF), -1) if self.flat else obs_BVF
-        return np.asarray(self.session.run([self.output], {self.input: values})[0])
+        values = {self.input: obs_BVF.reshape(len(obs_BVF), -1) if self.flat else obs_BVF}
+        if (state_BS is not None) != self.has_memory:
+            raise RapidError(
+                f"Agent '{self.name}' {'has a memory and needs' if self.has_memory else 'has no memory and takes no'} "
+                "state beside the observations: agent.start(worlds) gives the first."
+            )
+        return values if state_BS is None else values | {STATE: np.ascontiguousarray(state_BS, np.float32)}
 
 
 class Parity(NamedTuple):
@@ -106,7 +135,9 @@ class Parity(NamedTuple):
     """Share of observations on which both are greedy for the same action."""
 
 
-def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray) -> Parity:
+def export_onnx(
+    agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray, state_BS: np.ndarray | None = None
+) -> Parity:
     """Write an agent's network as ONNX and compare the two on given observations.
 
     Adapters that a closed gate shuts out are left out of the file.
@@ -115,6 +146,7 @@ def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray
         agent: the agent.
         path: the file; written only if the comparison succeeds.
         obs_BVF: real observations (B, V, F) for the comparison.
+        state_BS: what is remembered beside them (B, S), by an agent with a memory; None is as at the beginning.
 
     Raises:
         RapidError: the extra `export` is not installed, there are no observations, or the exported model gives other
@@ -135,13 +167,16 @@ def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray
         "features": FEATURES,
         "actions": ACTIONS,
         "mirrored_lanes": agent.mirrored_lanes,
+        "memory": agent.has_memory,
     }
+    if agent.has_memory and state_BS is None:
+        state_BS = agent.start(len(obs_BVF))
     model = build_model(network)
     onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(description)})
     with files.atomic_path(path) as temporary:
         onnx.save(model, os.fspath(temporary))
-        expected = agent.q_values(obs_BVF)
-        exported = OnnxAgent(temporary, agent.name).q_values(obs_BVF)
+        expected = agent.q_values(obs_BVF, state_BS)
+        exported = OnnxAgent(temporary, agent.name).q_values(obs_BVF, state_BS)
         difference = float(np.abs(exported - expected).max())
         allowed = TOLERANCE * max(1.0, float(np.abs(expected).max()))
         if not difference <= allowed:
@@ -160,26 +195,32 @@ def export_onnx(agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray
     return Parity(len(obs_BVF), difference, float((exported.argmax(1) == expected.argmax(1)).mean()))
 
 
-def driven_observations(agent: QAgent, scenario: str, seeds: Sequence[int]) -> np.ndarray:
-    """Return every observation (B, V, F) that the agent meets in one episode of each spawn seed."""
+def driven_observations(agent: QAgent, scenario: str, seeds: Sequence[int]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return every observation (B, V, F) that the agent meets in one episode of each spawn seed.
+
+    Beside them what it remembers there (B, S), if it has a memory.
+    """
     from rapid.simulator import make_vec
 
     worlds: Any = make_vec(scenario, len(seeds), autoreset=False, config=seeing(agent.vehicles))
     obs_WVF, _ = worlds.reset(seed=list(seeds))
     met, running_W = [np.array(obs_WVF)], np.ones(len(seeds), np.bool_)
+    states = [agent.start(len(seeds))] if agent.has_memory else []
     while running_W.any():
-        obs_WVF, _, terminated_W, truncated_W, _ = worlds.step(agent.act(met[-1]))
+        action_W = agent.act(met[-1], states[-1] if states else None)
+        obs_WVF, _, terminated_W, truncated_W, _ = worlds.step(action_W)
         met.append(np.array(obs_WVF))
+        if states:
+            states.append(agent.remember(states[-1], action_W))
         running_W &= ~(terminated_W | truncated_W)
     worlds.close()
-    return np.concatenate(met)
+    return np.concatenate(met), np.concatenate(states) if states else None
 
 
 def latency(path: str | os.PathLike[str], obs_VF: np.ndarray, calls: int = 2_000) -> float:
     """Return the median seconds of one decision at batch 1 on one thread, the array in and the action out."""
     agent = OnnxAgent(path)
-    session, obs_BVF = agent.session, check_observations(obs_VF[None], agent.name, agent.vehicles)
-    inputs = {agent.input: obs_BVF.reshape(1, -1) if agent.flat else obs_BVF}
+    session, inputs = agent.session, agent.inputs(obs_VF[None], agent.start(1) if agent.has_memory else None)
     warm_up, seconds = 100, list[float]()
     for _ in range(warm_up + calls):
         start = time.perf_counter()

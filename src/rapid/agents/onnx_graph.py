@@ -8,7 +8,7 @@ Shapes: B batch, V vehicles, F features of the network, G of the graph, D width,
 tokens. Rows are (B*T, D).
 """
 
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,14 @@ from torch import Tensor, nn
 
 from rapid.networks.blocks import Block, Transformer
 from rapid.networks.encoding import BESIDE, NEAR, NEAR_FEATURES
+from rapid.networks.memory import STATE_SIZE
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.mlp import MlpHead
 from rapid.networks.q_network import MIRRORED_ACTIONS, ActionDecoder, QNetwork, TokenHead
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES
+
+if TYPE_CHECKING:
+    from rapid.agents.onnx_memory import Names
 
 OPSET, IR_VERSION = 17, 8
 Array = NDArray[np.float32]
@@ -54,36 +58,49 @@ class Graph:
         bounds = [self.constant([number], np.int64) for number in (start, end, axis)]
         return self.node("Slice", value, *bounds)
 
+    def number(self, condition: str) -> str:
+        """Return 1 where a condition holds, else 0."""
+        return self.node("Cast", condition, to=self._onnx.TensorProto.FLOAT)
+
     def linear(self, rows: str, layer: nn.Linear) -> str:
         """Return what the layer makes of rows."""
-        return self.node("Gemm", rows, _array(layer.weight).T, _array(layer.bias))
+        return self.node("Gemm", rows, array(layer.weight).T, array(layer.bias))
 
     def norm(self, rows: str, layer: nn.LayerNorm) -> str:
         """Return the rows normalised."""
-        return self.node(
-            "LayerNormalization", rows, _array(layer.weight), _array(layer.bias), axis=-1, epsilon=layer.eps
-        )
+        return self.node("LayerNormalization", rows, array(layer.weight), array(layer.bias), axis=-1, epsilon=layer.eps)
 
 
 def build_model(network: QNetwork) -> Any:
     """Return the `onnx.ModelProto` that reads `obs` (B, V, F) and gives `q` (B, A).
+
+    That of a network with a memory also reads `state` (B, S), and gives `next_state`, that after the greedy action.
 
     Raises:
         ImportError: onnx is not installed.
     """
     import onnx
 
-    graph = Graph(onnx, network.config.vehicles)
+    from rapid.agents.onnx_memory import next_state
+
+    graph, memory = Graph(onnx, network.config.vehicles), network.memory
     _q_values(graph, network)
     # The Q-values are what the last node gives.
     graph.nodes[-1].output[0] = "q"
+    if memory is not None:
+        next_state(graph, memory, "state", "q")
+        graph.nodes[-1].output[0] = "next_state"
     kind, make = onnx.TensorProto.FLOAT, onnx.helper.make_tensor_value_info
+    state = (kind, ["batch", STATE_SIZE])
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
             graph.nodes,
             "rapid",
-            [make("obs", kind, ["batch", graph.vehicles, NUM_FEATURES])],
-            [make("q", kind, ["batch", NUM_ACTIONS])],
+            [
+                make("obs", kind, ["batch", graph.vehicles, NUM_FEATURES]),
+                *([] if memory is None else [make("state", *state)]),
+            ],
+            [make("q", kind, ["batch", NUM_ACTIONS]), *([] if memory is None else [make("next_state", *state)])],
             graph.constants,
         ),
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
@@ -99,8 +116,8 @@ def _q_values(graph: Graph, network: QNetwork) -> str:
         return _seen(graph, network, "obs")
     # The road and its mirror image as one batch.
     encoding = network.encoding
-    turned = graph.node("Add", graph.node("Mul", "obs", _array(encoding.turned_F)), _array(encoding.far_side_F))
-    present = graph.node("Greater", graph.cut("obs", 0, 1, 2), _array(encoding.absent_V1))
+    turned = graph.node("Add", graph.node("Mul", "obs", array(encoding.turned_F)), array(encoding.far_side_F))
+    present = graph.node("Greater", graph.cut("obs", 0, 1, 2), array(encoding.absent_V1))
     both = graph.node("Concat", "obs", graph.node("Where", present, turned, "obs"), axis=0)
     both = graph.reshape(_seen(graph, network, both), 2, -1, NUM_ACTIONS)
     actions = graph.constant(MIRRORED_ACTIONS, np.int64)
@@ -112,19 +129,24 @@ def _q_values(graph: Graph, network: QNetwork) -> str:
 def _seen(graph: Graph, network: QNetwork, obs: str) -> str:
     """Return the Q-values (B, A) of observations as they are."""
     head, encoding = network.head, network.encoding
+    names = None
+    if network.memory is not None:
+        from rapid.agents.onnx_memory import believed, recalled
+
+        names, obs = recalled(graph, network.memory, obs, "state"), believed(graph, network.memory, obs, "state")
     features, read_GF = obs, np.eye(NUM_FEATURES, dtype=np.float32)
     if encoding.kind == "normalized":
-        read_GF /= _array(encoding.scale_F)
+        read_GF /= array(encoding.scale_F)
     elif encoding.kind in ("ego", "near"):
         ego = graph.cut(obs, 0, 1, 1)
-        features = graph.node("Sub", obs, graph.node("Mul", ego, _array(encoding.relative_VF)))
-        read_GF /= _array(encoding.unit_F)
+        features = graph.node("Sub", obs, graph.node("Mul", ego, array(encoding.relative_VF)))
+        read_GF /= array(encoding.unit_F)
         if encoding.kind == "near":
             features = _near(graph, features)
             read_GF = _read_near(read_GF)
     present = None
     if encoding.mask_absent:
-        present = graph.node("Greater", graph.cut(obs, 0, 1, 2), _array(encoding.absent_V1))
+        present = graph.node("Greater", graph.cut(obs, 0, 1, 2), array(encoding.absent_V1))
     if not isinstance(head, TokenHead):
         assert isinstance(head, MlpHead)  # agents are never stacks
         if present:
@@ -132,7 +154,8 @@ def _seen(graph: Graph, network: QNetwork, obs: str) -> str:
         return _mlps(graph, head, features, read_GF)
     # What the rows of absent vehicles hold has no influence: the mask hides them, and none of them is read.
     mask = graph.reshape(graph.node("Where", present, 0.0, -np.inf), -1, 1, 1, graph.vehicles) if present else None
-    return _decoder(graph, head.decoder, _mixture(graph, head.mixture, features, read_GF, mask), mask)
+    tokens = _mixture(graph, head.mixture, features, read_GF, mask, names)
+    return _decoder(graph, head.decoder, tokens, mask, names)
 
 
 def _near(graph: Graph, relative: str) -> str:
@@ -154,35 +177,44 @@ def _read_near(read_FF: Array) -> Array:
 
 def _mlps(graph: Graph, head: MlpHead, features: str, read_GF: Array) -> str:
     flat, total = graph.reshape(features, -1, graph.vehicles * len(read_GF)), ""
-    weights_N = [1.0] if head.weights_N is None else _array(head.weights_N).tolist()
+    weights_N = [1.0] if head.weights_N is None else array(head.weights_N).tolist()
     for mlp, weight in zip(head.mlps, weights_N, strict=True):
         layers = [layer for layer in cast(nn.Sequential, mlp) if isinstance(layer, nn.Linear)]
         rows = flat
         for index, layer in enumerate(layers):
-            last, matrix = index == len(layers) - 1, _array(layer.weight).T
+            last, matrix = index == len(layers) - 1, array(layer.weight).T
             matrix = np.kron(np.eye(graph.vehicles, dtype=np.float32), read_GF) @ matrix if index == 0 else matrix
             share = np.float32(weight if last else 1.0)
-            rows = graph.node("Gemm", rows, matrix * share, _array(layer.bias) * share)
+            rows = graph.node("Gemm", rows, matrix * share, array(layer.bias) * share)
             rows = rows if last else graph.node("Relu", rows)
         total = graph.node("Add", total, rows) if total else rows
     return total
 
 
-def _mixture(graph: Graph, mixture: MixtureOfPolicies, features: str, read_GF: Array, mask: str | None) -> str:
+def _mixture(
+    graph: Graph,
+    mixture: MixtureOfPolicies,
+    features: str,
+    read_GF: Array,
+    mask: str | None,
+    names: "Names | None" = None,
+) -> str:
     """Return the mixed tokens (B, V, D)."""
     first, *adapters = (cast(PolicyEncoder, policy) for policy in mixture.policies)
     tokens = _policy(graph, first, features, read_GF, mask)
     if mixture.router is None:
         return tokens
     into, _, out = mixture.router
-    hidden = graph.node("MatMul", features, read_GF @ _array(cast(nn.Linear, into).weight).T)
-    hidden = graph.node("Relu", graph.node("Add", hidden, _array(cast(nn.Linear, into).bias)))
-    logits = graph.node("MatMul", hidden, _array(cast(nn.Linear, out).weight).T)
-    logits = graph.node("Add", logits, _array(cast(nn.Linear, out).bias))
+    hidden = graph.node("MatMul", features, read_GF @ array(cast(nn.Linear, into).weight).T)
+    hidden = graph.node("Relu", graph.node("Add", hidden, array(cast(nn.Linear, into).bias)))
+    logits = graph.node("MatMul", hidden, array(cast(nn.Linear, out).weight).T)
+    logits = graph.node("Add", logits, array(cast(nn.Linear, out).bias))
+    if names is not None:
+        logits = graph.node("Add", logits, graph.reshape(names.router, -1, 1, len(mixture.policies)))
     if mixture.top_k < len(mixture.policies):
         logits = _top_k(graph, logits, len(mixture.policies), mixture.top_k)
     weights = graph.node("Softmax", logits, axis=-1)
-    gate_VN = np.concatenate([np.ones((graph.vehicles, 1)), _array(mixture.gate_NV).T], 1).astype(np.float32)
+    gate_VN = np.concatenate([np.ones((graph.vehicles, 1)), array(mixture.gate_NV).T], 1).astype(np.float32)
     if mixture.gate_kind == "tanh":
         gate_VN[:, 0], gate_VN[:, 1:] = 0, np.tanh(gate_VN[:, 1:])
     opened = [index for index in range(1, len(mixture.policies)) if gate_VN[:, index].any()]
@@ -197,7 +229,7 @@ def _mixture(graph: Graph, mixture: MixtureOfPolicies, features: str, read_GF: A
         share = graph.cut(weights, 0, 1, 2)
     mixed = graph.node("Mul", tokens, share)
     for index in opened:
-        tokens = _policy(graph, adapters[index - 1], features, read_GF, mask)
+        tokens = _policy(graph, adapters[index - 1], features, read_GF, mask, names)
         part = graph.node("Mul", tokens, graph.cut(weights, index, index + 1, 2))
         mixed = graph.node("Add", mixed, part)
     return mixed
@@ -215,30 +247,44 @@ def _top_k(graph: Graph, logits: str, policies: int, kept: int) -> str:
     return graph.node("Concat", own, closed, axis=-1)
 
 
-def _policy(graph: Graph, policy: PolicyEncoder, features: str, read_GF: Array, mask: str | None) -> str:
+def _policy(
+    graph: Graph,
+    policy: PolicyEncoder,
+    features: str,
+    read_GF: Array,
+    mask: str | None,
+    names: "Names | None" = None,
+) -> str:
     """Return the policy's tokens (B, V, D)."""
     width = policy.projection.out_features
-    bias_VD = np.tile(_array(policy.projection.bias), (graph.vehicles, 1))
+    bias_VD = np.tile(array(policy.projection.bias), (graph.vehicles, 1))
     if policy.position is not None:
-        position = _array(cast(Tensor, policy.position))
+        position = array(cast(Tensor, policy.position))
         bias_VD[: len(position)] += position
-    tokens = graph.node("MatMul", features, read_GF @ _array(policy.projection.weight).T)
-    rows = graph.reshape(graph.node("Add", tokens, bias_VD), -1, width)
+    tokens = graph.node("MatMul", features, read_GF @ array(policy.projection.weight).T)
+    tokens = graph.node("Add", tokens, bias_VD)
+    if names is not None:
+        tokens = graph.node("Add", tokens, graph.reshape(names.token, -1, 1, width))
+    rows = graph.reshape(tokens, -1, width)
     rows = _transformer(graph, policy.transformer, rows, graph.vehicles, mask)
     return graph.reshape(rows, -1, graph.vehicles, width)
 
 
-def _decoder(graph: Graph, decoder: ActionDecoder, tokens: str, mask: str | None) -> str:
+def _decoder(graph: Graph, decoder: ActionDecoder, tokens: str, mask: str | None, names: "Names | None" = None) -> str:
     """Return the Q-values (B, A)."""
     length, width, first_D = graph.vehicles, decoder.head.in_features, None
     if decoder.action_token is not None:
-        length, first_D = length + 1, _array(decoder.action_token)[0, 0]
+        length, first_D = length + 1, array(decoder.action_token)[0, 0]
         pads = graph.constant([0, 1, 0, 0, 0, 0], np.int64)
         token_TD = np.zeros((length, width), np.float32)
         token_TD[0] = first_D
         tokens = graph.node("Add", graph.node("Pad", tokens, pads), token_TD)
         if mask:
             mask = graph.node("Pad", mask, graph.constant([0, 0, 0, 1, 0, 0, 0, 0], np.int64))
+    if names is not None:
+        # To the token that is read alone, which is then no longer the same whatever is known.
+        after, first_D = graph.constant([0, 0, 0, 0, length - 1, 0], np.int64), None
+        tokens = graph.node("Add", tokens, graph.node("Pad", graph.reshape(names.action, -1, 1, width), after))
     rows = graph.reshape(tokens, -1, width)
     blocks = [cast(Block, block) for block in decoder.transformer.blocks]
     for block in blocks[:-1]:
@@ -278,7 +324,7 @@ class _Attention:
         self.ask_E = np.einsum("hs,hse->he", query_HS, key_HSD).reshape(-1) / size**0.5
         self.give_ED = np.einsum("hsd,hse->hde", value_HSD, out_HSD).reshape(-1, width)
         """What the heads attended to (., H*D) to the block's tokens (., D)."""
-        self.give_D = np.einsum("hs,hsd->d", value_HS, out_HSD) + _array(block.attention_out.bias)
+        self.give_D = np.einsum("hs,hsd->d", value_HS, out_HSD) + array(block.attention_out.bias)
 
 
 def _block(graph: Graph, block: Block, rows: str, length: int, mask: str | None) -> str:
@@ -307,7 +353,7 @@ def _first_of_block(graph: Graph, block: Block, rows: str, length: int, mask: st
     else:
         norm = block.attention_norm
         centred_D = (first_D - first_D.mean()) / np.sqrt(first_D.var() + norm.eps)
-        normed_D = centred_D * _array(norm.weight) + _array(norm.bias)
+        normed_D = centred_D * array(norm.weight) + array(norm.bias)
         query = _float(normed_D @ attention.ask_DE + attention.ask_E).reshape(1, heads, 1, width)
     attended = _attend(graph, query, normed, length, mask, attention)
     attended = graph.reshape(attended, -1, heads * width)
@@ -345,7 +391,8 @@ def _first(graph: Graph, rows: str, length: int, width: int) -> str:
     return graph.node("Gather", graph.reshape(rows, -1, length, width), graph.constant(0, np.int64), axis=1)
 
 
-def _array(tensor: Tensor) -> Array:
+def array(tensor: Tensor) -> Array:
+    """Return a tensor's values."""
     return tensor.detach().cpu().numpy()
 
 
