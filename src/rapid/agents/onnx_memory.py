@@ -5,6 +5,7 @@ Most of it is affine in the state and in the ego's row, and so is one matrix eac
 Shapes: B batch, V vehicles, F features, S entries of a state, K numbers, D width, N policies.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -84,7 +85,7 @@ def recalled(graph: Graph, memory: Memory, obs: str, state: str) -> Names:
     hidden = graph.node("Relu", graph.linear(known, memory.hidden))
     out = graph.node("MatMul", hidden, array(memory.out.weight).T)
     ends = np.cumsum([0, *memory.sizes]).tolist()
-    return Names(*(graph.cut(out, start, end, 1) for start, end in zip(ends[:-1], ends[1:], strict=True)))
+    return Names(*(graph.cut(out, start, end, 1) for start, end in itertools.pairwise(ends)))
 
 
 def next_state(graph: Graph, memory: Memory, state: str, q: str) -> str:
