@@ -17,6 +17,7 @@ VERBS: dict[str, str] = {
     "mix": "phase 1: mix teacher and random transitions into one dataset",
     "distill": "phase 2: offline RL with the robust term, into a policy",
     "adapt": "phase 3: online DQN, then PPO if asked for, in the target scenario; the distilled policy frozen",
+    "adversary": "train an adversary against one agent, to be named among attacks",
     "evaluate": "drive policies and scripted drivers over fixed spawns, clean and attacked",
     "teach-bench": "compare teachers, models and prompt styles on the same spawns",
     "export": "write an agent as ONNX, check it against the original, time it",

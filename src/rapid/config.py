@@ -395,7 +395,14 @@ class EvaluateConfig:
     curve_spawns: Count = 20
     """Episodes of each point of a learning curve, from the set `tune`."""
     attacks: tuple[str, ...] = ("none", "uniform", "gaussian", "fgsm", "pgd")
-    """Attacks on the observations, by name."""
+    """Attacks on the observations, as texts such as pgd:steps=50,radius=0.02 (docs/attacks.md), and presets of them:
+    paper, suite, sensor, columns, sweep, with options such as suite:ego=trusted."""
+    teacher_attacks: tuple[str, ...] = ("none",)
+    """The same for the teacher: noise, lies and transfer can be made on it."""
+    adversary_steps: Positive = 40_000
+    """Decisions that an adversary is trained for, where the attack `adversary` names none."""
+    workers: Positive = 1
+    """Processes among which the attacks on an agent are divided; the results are the same."""
 
 
 @dataclass(frozen=True)
@@ -442,4 +449,10 @@ class Config:
 
 def without_place(config: Config) -> Config:
     """Return `config` with the settings at their defaults that say where and how fast it is computed, not what."""
-    return replace(config, threads=1, tracking="none", collect=replace(config.collect, engine="local", workers=1))
+    return replace(
+        config,
+        threads=1,
+        tracking="none",
+        collect=replace(config.collect, engine="local", workers=1),
+        evaluate=replace(config.evaluate, workers=1),
+    )

@@ -163,7 +163,8 @@ class Evaluate:
 
     agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
     """Directories of agents, ONNX files, and drivers by name: slower, idle, faster, random, rule, rule-forecast,
-    rule-foresight, uniform-safe, planner, planner-cars, planner-observation, teacher (the one of --config)."""
+    rule-foresight, uniform-safe, immune, blind, planner, planner-cars, planner-observation, teacher (the one of
+    --config)."""
     evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
     scenario: str = ""
     """Where they drive; by default where the saved agents were trained, else in lane-3-density-2."""
@@ -174,6 +175,27 @@ class Evaluate:
     seed: Seed = Config.seed
     """Decides the noise of attacks and the random driver; the traffic is fixed by the spawn seeds."""
     source: Flat[Source] = field(default_factory=Source)
+
+
+@dataclass(frozen=True)
+class Adversary:
+    """Train an adversary against one agent: it learns which of the actions in reach costs that agent most.
+
+    It is saved like an agent and named among attacks: rapid evaluate AGENT --attacks adversary:OUT.
+    """
+
+    agent: Annotated[Positional[str], arg(metavar="AGENT")]
+    """Directory of the agent, which stays as it is."""
+    scenario: str = Config.scenario
+    """Where it is attacked."""
+    attack: str = "adversary"
+    """The ball and the search in it, such as adversary:radius=0.05,ego=trusted (docs/attacks.md)."""
+    steps: Annotated[int, arg(metavar="INT")] = EvaluateConfig.adversary_steps
+    """Decisions to learn from."""
+    out: str = "adversary"
+    """Directory of the adversary."""
+    seed: Seed = Config.seed
+    """Decides traffic, exploration, weights and batches."""
 
 
 @dataclass(frozen=True)

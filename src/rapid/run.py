@@ -19,7 +19,7 @@ from rapid.phases.adapt import adapt_agent
 from rapid.phases.checks import check
 from rapid.phases.data import collect_transitions, data_folders, given_data, mix_datasets
 from rapid.phases.distill import distill_agent
-from rapid.phases.measure import FLOORS, PLANNER, TEACHER, measure, why_no_teacher
+from rapid.phases.measure import FLOORS, PLANNER, TEACHER, floors_under_attack, measure, why_no_teacher
 from rapid.phases.page import write_run_report
 from rapid.presets import offline_baseline
 from rapid.progress import format_seconds
@@ -184,6 +184,7 @@ def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
         specs.append(PLANNER)
     specs += [str(home.path / "distill" / name / "agent") for name in ("cloning", "offline-dqn", "rapid")]
     specs.append(str(home.path / "adapt" / "rapid" / "agent"))
+    specs += [spec for spec in floors_under_attack(config.adapt.scenario or config.scenario) if spec not in FLOORS]
     rows = measure(config, config.adapt.scenario or config.scenario, specs, home.path / "evaluate")
     return {"episodes": len(rows), **({"note": note} if note else {})}
 

@@ -58,7 +58,7 @@ class Entrant:
         """Return what drives in a scenario; a model is loaded here."""
         if self.teacher is None:
             return open_agent(PLANNER, scenario, seed)
-        return make_teacher(self.teacher, get_scenario(scenario).lanes, seed)
+        return make_teacher(self.teacher, get_scenario(scenario).lanes, seed, scenario)
 
 
 def read_spec(spec: str) -> Entrant:
@@ -219,7 +219,8 @@ def _check(
             raise RapidError(f"The {kind} '{twice[0]}' is named twice. Name each once.")
     if not scenarios:
         raise RapidError("Which scenarios? Name at least one with --scenario, or leave the option out.")
-    lanes = [get_scenario(name).lanes for name in scenarios]
+    for name in scenarios:
+        get_scenario(name)
     seeds = spawn_seeds(spawn_set, spawns)
     make_vec(scenarios[0], 1, simulator=config.simulator, autoreset=False).close()
     entrants = [read_spec(spec) for spec in specs]
@@ -227,7 +228,8 @@ def _check(
         if entrant.teacher is None and config.simulator != "compiled":
             raise RapidError("The planner searches with the compiled simulator: leave --simulator out, or the planner.")
         if entrant.teacher is not None and entrant.teacher.backend != "local":
-            make_teacher(entrant.teacher, lanes[0], config.seed)
+            for name in scenarios:
+                make_teacher(entrant.teacher, get_scenario(name).lanes, config.seed, name)
     for entrant in entrants:
         if entrant.teacher is not None and entrant.teacher.backend == "local":
             # Fetched, verified and unpacked, but not loaded: that would take the memory of all at once.

@@ -16,6 +16,7 @@ from rapid.config_io import to_dict, to_toml
 from rapid.errors import RapidError
 from rapid.options import (
     Adapt,
+    Adversary,
     Agents,
     Collect,
     Distill,
@@ -164,6 +165,15 @@ def _evaluate(options: Evaluate, config: Config) -> int:
 
     compare(config, options.agents, Path(options.out))
     print((Path(options.out) / "summary.txt").read_text(encoding="utf-8"))
+    return 0
+
+
+def _adversary(options: Adversary, config: Config) -> int:
+    from rapid.phases.adversary import train
+
+    out = _new_folder(options.out)
+    before, after = train(options.agent, options.scenario, options.attack, options.steps, out, options.seed)
+    print(f"The adversary is in {out}; in training the agent's return went from {before:.2f} to {after:.2f}")
     return 0
 
 
@@ -325,6 +335,7 @@ VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "distill": (Distill, _distill),
     "adapt": (Adapt, _adapt),
     "evaluate": (Evaluate, _evaluate),
+    "adversary": (Adversary, _adversary),
     "teach-bench": (TeachBench, _teach_bench),
     "export": (Export, _export),
     "report": (Report, _report),

@@ -10,14 +10,17 @@ import pytest
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
+from rapid.scenarios import PAPER_SCENARIOS
 from rapid.teacher import Decision, from_record, make_teacher, to_record
 from rapid.teacher.facts import gather
 from rapid.teacher.scene import read_scenes
-from rapid.teacher.scripted import SCRIPTED, safe_actions
+from rapid.teacher.scripted import SCRIPTED, Scripted, has_plan, plan_for, safe_actions
+
+REWARDS = ("", ":progress")
 
 
 def scripted(name, seed=0):
-    return make_teacher(TeacherConfig(backend="scripted", model=name), 3, seed)
+    return make_teacher(TeacherConfig(backend="scripted", model=name), 3, seed, "lane-3-density-2")
 
 
 def actions(decisions):
@@ -67,6 +70,39 @@ def test_rules_speed_up_on_a_free_road_and_brake_before_a_wall(world):
     for name in ("rule", "rule-forecast"):
         assert actions(scripted(name).decide(world(), [None])) == [3]
         assert actions(scripted(name).decide(wall, [None])) == [4]
+
+
+def test_immune_asks_only_whether_a_car_is_there(world, crowd):
+    immune = scripted("immune")
+    assert actions(immune.decide(world(), [None])) == [3]
+    assert actions(immune.decide(world(cars=((190, 2, 30),)), [None])) == [4]
+    lied_BVF = crowd + np.random.default_rng(0).uniform(-0.1, 0.1, crowd.shape) * [1, 200, 12, 80, 80]
+    assert actions(immune.decide(lied_BVF, [None] * len(crowd))) == actions(immune.decide(crowd, [None] * len(crowd)))
+
+
+def test_blind_follows_its_plan_whatever_it_sees(crowd):
+    blind = make_teacher(TeacherConfig(backend="scripted", model="blind:2,1,3"), 3)
+    previous, taken = [None] * 2, []
+    for step in range(8):
+        previous = blind.decide(crowd[step : step + 2], previous)
+        taken.append(actions(previous))
+    assert taken == [[action] * 2 for action in (4, 4, 2, 3, 3, 3, 1, 1)]
+    assert blind.describe()["plan"] == [2, 1, 3]
+
+
+def test_blind_has_a_plan_for_each_scenario_of_the_paper_and_says_so_of_others():
+    plans = {(scenario, reward): plan_for(scenario + reward) for scenario in PAPER_SCENARIOS for reward in REWARDS}
+    assert len(set(plans.values())) > 1
+    assert plan_for("lane-3-density-2:clock") == plans["lane-3-density-2", ""]
+    assert has_plan("lane-4-density-2.5:progress")
+    assert not has_plan("lane-6-density-2")
+    with pytest.raises(RapidError, match=r"no plan for lane-6-density-2.*rapid.evaluation.blind lane-6-density-2"):
+        Scripted("blind", 6, 0, "lane-6-density-2")
+    for plan in ("blind:1,2", "blind:1,2,x", "blind:1,2,-3"):
+        with pytest.raises(RapidError, match=r"written blind:5,2,4"):
+            Scripted(plan, 3, 0)
+    with pytest.raises(RapidError, match="Unknown scripted driver 'idle:1,2,3'"):
+        Scripted("idle:1,2,3", 3, 0)
 
 
 def test_unknown_drivers_are_refused():

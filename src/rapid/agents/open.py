@@ -53,8 +53,8 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
     """
     from rapid.teacher.scripted import SCRIPTED, Scripted
 
-    if spec in SCRIPTED:
-        return Scripted(spec, get_scenario(scenario).lanes, seed)
+    if spec in SCRIPTED or spec.startswith("blind:"):
+        return Scripted(spec, get_scenario(scenario).lanes, seed, scenario)
     if spec in PLANNERS:
         from rapid.simulator.belief import CarsPlanner, ObservationPlanner
         from rapid.simulator.search import PlannerAgent
@@ -116,7 +116,7 @@ def kind_of(agent: Any) -> Kind:
     if own in get_args(Kind):
         return cast(Kind, own)
     if callable(getattr(agent, "decide", None)):
-        return "floor" if getattr(agent, "name", "") in SCRIPTED else "teacher"
+        return "floor" if getattr(agent, "name", "").partition(":")[0] in SCRIPTED else "teacher"
     return "planner" if callable(getattr(agent, "bind", None)) else "learned"
 
 

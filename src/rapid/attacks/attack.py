@@ -43,6 +43,14 @@ class Attack(Protocol):
         """Whether it needs the agent's network."""
         ...
 
+    def check(self, agent: Any) -> None:
+        """Check that the attack can be made on an agent that offers what it needs.
+
+        Raises:
+            RapidError: it was made for another.
+        """
+        ...
+
     def begin(self, field: "Field") -> "Shown":
         """Return what is shown in episodes that begin now."""
         ...
@@ -156,6 +164,14 @@ class Base(ABC):
     @abstractmethod
     def __call__(self, network: Any, obs_BVF: Tensor, source: Source) -> Tensor:
         """Return the attacked observations."""
+
+    def check(self, agent: Any) -> None:
+        """Check that the attack can be made on an agent that offers what it needs.
+
+        Raises:
+            RapidError: it was made for another.
+        """
+        return
 
     def begin(self, field: Field) -> Shown:
         """Return what is shown in these episodes; whatever an attack remembers, it remembers there."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from rapid.attacks import kinds
+from rapid.attacks.adversary import AdversaryAttack
 from rapid.attacks.attack import Attack
 from rapid.attacks.spec import AttackSpec, Kind, as_spec
 from rapid.attacks.world import WorldAttack
@@ -19,6 +20,7 @@ _MAKERS: dict[Kind, Callable[[AttackSpec, int | None], Attack]] = {
     "lie": kinds.LieAttack,
     "coupled": kinds.CoupledAttack,
     "world": WorldAttack,
+    "adversary": AdversaryAttack,
 }
 
 

@@ -14,7 +14,18 @@ from urllib.parse import quote, unquote
 from rapid.errors import RapidError, did_you_mean
 
 Kind = Literal[
-    "none", "uniform", "gaussian", "fgsm", "pgd", "directed", "square", "transfer", "lie", "coupled", "world"
+    "none",
+    "uniform",
+    "gaussian",
+    "fgsm",
+    "pgd",
+    "directed",
+    "square",
+    "transfer",
+    "lie",
+    "coupled",
+    "world",
+    "adversary",
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 Norm = Literal["linf", "l2"]
@@ -80,12 +91,16 @@ class AttackSpec:
     budget: int = 0
     """`world`: decisions of an episode that may be attacked, there where it costs most; 0: all."""
     source: str = ""
-    """`transfer`: the agent that is attacked instead of the one that drives."""
+    """`transfer`: the agent that is attacked instead of the one that drives; `adversary`: directory of the adversary,
+    or nothing where one is to be trained against each agent."""
     label: str = field(default="", compare=False)
     """How tables call it, if not by its text."""
 
     def __post_init__(self) -> None:
         _check(self)
+        if self.metres or self.speed:
+            # Of a box in metres the radius says nothing, so it must not tell two of them apart.
+            object.__setattr__(self, "radius", defaults_of(self.kind)["radius"])
 
     @property
     def name(self) -> str:
@@ -142,6 +157,7 @@ class AttackSpec:
             "square": f"{ball}, without gradients, {self.queries} points{loss}",
             "transfer": f"{ball}, made on {self.source}, {runs}{loss}",
             "lie": f"the same lie in every step: {self.to}, within {units}",
+            "adversary": f"{ball}, the action in reach that a learned adversary calls worst, {runs}",
             "world": f"{ball}, the action in reach that is worst in the true world within {self.horizon} decisions, "
             f"{f'{self.budget} attacked decisions an episode' if self.budget else 'every decision'}, {runs}",
             "coupled": f"{ball}, changing by {self.coupling:.0%} of it a step at most, {runs}{loss}",
@@ -161,6 +177,7 @@ _FIELDS: dict[Kind, tuple[str, ...]] = {
     "transfer": ("source", *_RUNS, "loss"),
     "lie": ("to", *_SIZE),
     "world": ("horizon", "budget", *_RUNS),
+    "adversary": ("source", *_RUNS),
     "coupled": ("coupling", "steps", "step", "restarts", *_SIZE, "loss"),
 }
 
@@ -170,6 +187,7 @@ _OWN_DEFAULTS: dict[Kind, dict[str, Any]] = {
     "directed": {"steps": 20, "restarts": 2},
     "square": {"loss": "margin"},
     "world": {"steps": 20, "restarts": 1},
+    "adversary": {"steps": 20, "restarts": 1},
 }
 
 
@@ -309,7 +327,7 @@ def _check(spec: AttackSpec) -> None:
         )
     if spec.norm == "l2" and (spec.metres or spec.speed):
         raise RapidError("metres and speed are half widths of a box: leave norm at 'linf', or give a radius instead.")
-    if spec.source == "" and "source" in fields_of(spec.kind):
+    if spec.source == "" and spec.kind == "transfer":
         raise RapidError(
             f"An attack of kind '{spec.kind}' needs a source: write {spec.kind}:DIRECTORY, with the directory of the "
             "agent that is attacked instead."

@@ -29,11 +29,15 @@ _SHOWN = {
     "rule": "rule",
     "rule-forecast": "rule, forecast",
     "rule-foresight": "rule, foresight",
+    "immune": "immune: brakes while any car is there",
+    "blind": "blind: a fixed plan",
     "planner-cars": "planner, drivers unknown",
     "planner-observation": "planner, as observed",
 }
 
 CLEAN = "none"
+WIDE = 6
+"""Attacks that a table of plain text holds side by side; more of them stand one below the other."""
 METRICS: tuple[str, ...] = (
     "episode_return",
     "crashed",
@@ -189,7 +193,8 @@ def summary_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
             names = list(here[0].attacks)
             lines = [["return under attack", "none", *names]]
             lines += [[row.label, number(row.metrics["episode_return"].value), *_attack_texts(row)] for row in here]
-            blocks.append(aligned(lines))
+            # Many attacks would make lines that no screen holds.
+            blocks.append(aligned(lines if len(names) <= WIDE else list(zip(*lines, strict=True))))
     if any(cell.missing == NOT_APPLICABLE for row in summaries for cell in row.attacks.values()):
         blocks.append(f"{NOT_APPLICABLE}: {NOT_APPLICABLE_WHY}")
     blocks.append(units(summaries))

@@ -3,6 +3,7 @@
 import torch
 
 from rapid.attacks import get_attack
+from rapid.attacks.suite import expand
 from rapid.config import Config
 from rapid.config_io import validate
 from rapid.data.collection import parse_shard
@@ -28,9 +29,9 @@ def check(config: Config) -> None:
             f"Device '{config.device}' cannot be used: {str(error).splitlines()[0].rstrip('.')}. Use --device cpu."
         ) from error
     lanes = get_scenario(config.scenario).lanes
-    for name in config.evaluate.attacks:
-        get_attack(name, lanes)
+    for spec in expand((*config.evaluate.attacks, *config.evaluate.teacher_attacks)):
+        get_attack(spec, lanes)
     parse_shard(config.collect.shard)
     check_engine(config.collect.engine)
     check_tracking(config.tracking)
-    check_teacher(config.teacher, lanes)
+    check_teacher(config.teacher, lanes, config.scenario)

@@ -44,7 +44,7 @@ def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher"
             "--engine local, or choose another directory."
         )
     if shards == 1:
-        teacher = make_teacher(settings, get_scenario(config.scenario).lanes, config.seed)
+        teacher = make_teacher(settings, get_scenario(config.scenario).lanes, config.seed, config.scenario)
         with task(f"collect, {teacher.name}", wanted, "transitions") as work:
             return collect(teacher, config.scenario, out, wanted, lockstep, shard=sizes.shard, progress=work, **options)
     # Each worker has a teacher of its own; together they ask no more than one would.
@@ -57,7 +57,7 @@ def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher"
     title = f"collect, {settings.model}, {shards} shards"
     with task(title, wanted, "transitions") as work:
         return collect_shards(
-            partial(_worker_teacher, settings, get_scenario(config.scenario).lanes, config.seed, config.threads),
+            partial(_worker_teacher, settings, config.scenario, config.seed, config.threads),
             config.scenario,
             out,
             wanted,
@@ -70,9 +70,9 @@ def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher"
         )
 
 
-def _worker_teacher(settings: TeacherConfig, lanes: int, seed: int, threads: int) -> Teacher:
+def _worker_teacher(settings: TeacherConfig, scenario: str, seed: int, threads: int) -> Teacher:
     torch.set_num_threads(threads)
-    return make_teacher(settings, lanes, seed)
+    return make_teacher(settings, get_scenario(scenario).lanes, seed, scenario)
 
 
 def data_folders(config: Config, directory: Path) -> tuple[Path, Path]:

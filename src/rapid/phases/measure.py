@@ -1,29 +1,43 @@
 """Measuring on disk: agents over the test spawns, each driven once, with table and plot."""
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from rapid.agents.open import PLANNERS, check_road, open_agent
 from rapid.agents.saved import QAgent
-from rapid.config import Config
+from rapid.attacks import get_attack
+from rapid.attacks.adversary import fingerprint, save_adversary, train_adversary
+from rapid.attacks.attack import offers
+from rapid.attacks.spec import AttackSpec
+from rapid.attacks.suite import PRESETS, expand
+from rapid.config import Config, without_place
 from rapid.config_io import to_dict
+from rapid.engines import run_jobs
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, explained_by, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
+from rapid.evaluation.worst import worst_text
 from rapid.files import read_json, sha256, write_json, write_text
 from rapid.networks.q_network import QNetwork
 from rapid.phases.checks import check
 from rapid.phases.data import given_data
 from rapid.progress import task
 from rapid.report import ReportData, write_figures
+from rapid.report.figures import save_figure
+from rapid.report.sweep import sweep_figure, sweep_text
 from rapid.runs import commit
 from rapid.scenarios import get_scenario
 from rapid.spawns import spawn_seeds
 from rapid.teacher import make_teacher
 from rapid.teacher.models import is_present
+from rapid.teacher.scripted import has_plan
 
 FLOORS = ("slower", "idle", "random", "rule")
 """Scripted drivers that stand under every score."""
@@ -42,26 +56,48 @@ def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]
     check(config)
     # Opened once: a language model takes long to load, and as much memory again.
     opened = {spec: _open(config, spec, config.scenario) for spec in specs}
-    names = [str(opened[spec].name) for spec in specs]
+    names = [_checked_name(config, opened[spec]) for spec in specs]
     # Two trainings of the same name would fall into one row of the table.
     labels = {spec: f"{name} ({spec})" for spec, name in zip(specs, names, strict=True) if names.count(name) > 1}
     files = [Path(spec) / "config.json" if Path(spec).is_dir() else Path(spec) for spec in specs]
+    settings = to_dict(without_place(config).evaluate)
     request = {
         "agents": [[spec, sha256(file) if file.is_file() else ""] for spec, file in zip(specs, files, strict=True)],
         "teacher": to_dict(config.teacher) if TEACHER in specs else None,
         "scenario": config.scenario,
         "simulator": config.simulator,
         "seed": config.seed,
-        "evaluate": to_dict(config.evaluate) | {"attacks": list(config.evaluate.attacks)},
+        "evaluate": {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()},
     }
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         if not (out / "request.json").exists() or read_json(out / "request.json") != request:
             raise RapidError(f"'{out}' holds something else than this comparison. Choose another --out, or empty it.")
     else:
         write_json(out / "request.json", request)
+    if set(specs).isdisjoint(FLOORS) and any(text.partition(":")[0] in PRESETS for text in config.evaluate.attacks):
+        floors = floors_under_attack(config.scenario)
+        opened |= {spec: _open(config, spec, config.scenario) for spec in floors}
+        specs = [*specs, *floors]
     rows = measure(config, config.scenario, specs, out, labels, opened)
     write_figures(ReportData(title=f"{config.scenario}", rows=rows), out)
     return rows
+
+
+def _checked_name(config: Config, agent: Any) -> str:
+    """Return the name of an agent on which all attacks can be made that need what it has.
+
+    Raises:
+        RapidError: an attack was made for another agent.
+    """
+    for each in expand(config.evaluate.attacks):
+        if each.source and (attack := get_attack(each, get_scenario(config.scenario).lanes)).needs in offers(agent):
+            attack.check(agent)
+    return str(agent.name)
+
+
+def floors_under_attack(scenario: str) -> list[str]:
+    """Return the drivers that no lie about other cars can mislead, as far as there is a plan for this scenario."""
+    return ["slower", "immune", *(["blind"] if has_plan(scenario) else [])]
 
 
 def why_no_teacher(config: Config) -> str:
@@ -84,7 +120,7 @@ def why_no_teacher(config: Config) -> str:
 
 def _open(config: Config, spec: str, scenario: str) -> Any:
     if spec == TEACHER:
-        return make_teacher(config.teacher, get_scenario(scenario).lanes, config.seed)
+        return make_teacher(config.teacher, get_scenario(scenario).lanes, config.seed, scenario)
     agent = open_agent(spec, scenario, config.seed, config.device)
     check_road(agent, scenario)
     return agent
@@ -112,9 +148,10 @@ def measure(
             agent = opened[spec] if opened else _open(config, spec, scenario)
             if labels and spec in labels:
                 agent.name = labels[spec]
-            episodes = _drive(config, scenario, spec, agent)
+            driven = _drive(config, scenario, spec, agent, out)
+            episodes = [of for _, of in driven]
             recordings = [recording for of in episodes for recording in of.recordings[:RECORDED]]
-            recordings += _crashes(config, agent, episodes)
+            recordings += _crashes(config, agent, driven)
             if recordings:
                 save_recordings(
                     part.with_suffix(".recordings.json"), [explained_by(agent, each) for each in recordings]
@@ -125,38 +162,70 @@ def measure(
             )
         rows += load_rows(part)
     save_rows(out / "episodes.parquet", rows)
-    write_text(out / "summary.txt", summary_text(rows) + "\n")
+    texts = (summary_text(rows), worst_text(rows), sweep_text(rows))
+    write_text(out / "summary.txt", "\n\n".join(text for text in texts if text) + "\n")
+    if (figure := sweep_figure(rows)) is not None:
+        save_figure(figure, out / "sweep.png")
     return rows
 
 
-def _drive(config: Config, scenario: str, spec: str, agent: Any) -> list[Episodes]:
-    spawns, attacks = config.evaluate.spawns, config.evaluate.attacks
+def _with_adversary(config: Config, scenario: str, agent: Any, attack: AttackSpec, out: Path) -> AttackSpec:
+    """Return the attack; where an adversary is to be trained, with the one that is kept in `out`."""
+    if attack.kind != "adversary" or attack.source:
+        return attack
+    steps = config.evaluate.adversary_steps
+    of = f"{fingerprint(agent.network)} {scenario} {attack.name} {steps} {config.seed}"
+    home = out / "adversaries" / hashlib.sha256(of.encode()).hexdigest()[:12]
+    if not (home / "config.json").exists():
+        with task(f"adversary, {agent.name}", steps, "steps") as work:
+            director = train_adversary(agent, scenario, attack, steps, config.seed, lambda done, _: work.advance(done))
+        save_adversary(home, director, agent, scenario, attack, steps)
+    return replace(attack, source=str(home), label=attack.name)
+
+
+def _drive(config: Config, scenario: str, spec: str, agent: Any, out: Path) -> list[tuple[AttackSpec, Episodes]]:
+    spawns, attacks = config.evaluate.spawns, expand(config.evaluate.attacks)
     if spec == TEACHER:
-        # A language model takes long over a decision: fewer spawns, and only as it drives undisturbed.
-        spawns, attacks = config.evaluate.teacher_spawns, ("none",)
+        # A language model takes long over a decision: fewer spawns, and fewer attacks.
+        spawns, attacks = config.evaluate.teacher_spawns, expand(config.evaluate.teacher_attacks)
     elif spec in PLANNERS:
         spawns = config.evaluate.planner_spawns
-    attacks = [name for name in attacks if is_applicable(agent, name)]
+    attacks = [attack for attack in attacks if is_applicable(agent, attack)]
+    attacks = [_with_adversary(config, scenario, agent, attack, out) for attack in attacks]
+    workers = min(config.evaluate.workers, len(attacks))
+    jobs = [(config, scenario, spec, agent if workers == 1 else agent.name, attack, spawns) for attack in attacks]
+    found: dict[int, Episodes] = {}
     with task(f"evaluate, {agent.name}", spawns * len(attacks), "episodes") as work:
-        return [
-            run_episodes(
-                agent,
-                scenario,
-                spawn_seeds("test", spawns),
-                attack,
-                generator_seed=config.seed,
-                record=attack == "none" and (spec == TEACHER or agent.name == "RAPID"),
-                simulator=config.simulator,
-                progress=work.advance,
-            )
-            for attack in attacks
-        ]
+        for place, episodes in run_jobs(
+            _drive_under, jobs, workers=workers, receive=lambda _, ended: work.advance(ended)
+        ):
+            found[place] = episodes
+    return [(attack, found[place]) for place, attack in enumerate(attacks)]
 
 
-def _crashes(config: Config, agent: Any, measured: Sequence[Episodes]) -> list[Recording]:
+def _drive_under(job: tuple[Config, str, str, Any, AttackSpec, int], report: Callable[[Any], None]) -> Episodes:
+    """Drive an agent, or in a process of its own the one that `spec` names, under one attack."""
+    config, scenario, spec, agent, attack, spawns = job
+    if isinstance(agent, str):
+        torch.set_num_threads(config.threads)
+        name, agent = agent, _open(config, spec, scenario)
+        agent.name = name
+    return run_episodes(
+        agent,
+        scenario,
+        spawn_seeds("test", spawns),
+        attack,
+        generator_seed=config.seed,
+        record=attack == AttackSpec() and (spec == TEACHER or agent.name == "RAPID"),
+        simulator=config.simulator,
+        progress=report,
+    )
+
+
+def _crashes(config: Config, agent: Any, driven: Sequence[tuple[AttackSpec, Episodes]]) -> list[Recording]:
     """Drive the first crashes of a learned agent again, under each attack, to keep what happened step by step."""
     found: list[Recording] = []
-    for of in measured:
+    for attack, of in driven:
         known = {recording.seed for recording in of.recordings[:RECORDED]}
         seeds = [int(seed) for seed in of.seed_E[of.crashed_E] if int(seed) not in known]
         seeds = seeds[: CRASHES.get(of.agent, 1)] if of.kind == "learned" else []
@@ -165,12 +234,12 @@ def _crashes(config: Config, agent: Any, measured: Sequence[Episodes]) -> list[R
                 agent,
                 of.scenario,
                 seeds,
-                of.attack,
+                attack,
                 generator_seed=config.seed,
                 record=True,
                 simulator=config.simulator,
             )
-            # An attack that draws for all worlds at once may spare a car that it made crash among others.
+            # Among fewer worlds the network's sums round otherwise, so another action may win by a hair.
             found += [recording for recording in again.recordings if recording.crashed]
     return found
 

@@ -1,17 +1,21 @@
 """Drivers that need no model: constants, chance, and rules over the same facts that a model is told.
 
-They are floors to beat, controls that show what the model adds, and a way to run everything without any weights.
+They are floors to beat, controls that show what the model adds, and a way to run everything without any weights. Two
+of them cannot be misled about where other cars are: `immune` asks only whether any is there, `blind` nothing at all.
 """
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError, did_you_mean
-from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, SLOWER
+from rapid.files import read_json
+from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, SLOWER, get_scenario
 from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision
 from rapid.teacher.facts import Facts, gather
@@ -21,24 +25,32 @@ _CONSTANTS = {"idle": IDLE, "slower": SLOWER, "faster": FASTER}
 
 
 class Scripted:
-    """A driver without a model. `name` is one of :data:`SCRIPTED`.
+    """A driver without a model.
+
+    Args:
+        name: one of :data:`SCRIPTED`, or a plan of its own for `blind`, such as ``blind:5,2,4``.
+        lanes: of the road.
+        seed: for those that draw.
+        scenario: where it drives; `blind` has a plan for each scenario that :mod:`rapid.evaluation.blind` searched.
 
     Raises:
-        RapidError: there is no driver of this name.
+        RapidError: there is no driver of this name, or no plan for `blind`.
     """
 
-    def __init__(self, name: str, lanes: int, seed: int) -> None:
-        if name not in SCRIPTED:
+    def __init__(self, name: str, lanes: int, seed: int, scenario: str = "") -> None:
+        kind, _, plan = name.partition(":")
+        if kind not in SCRIPTED or (plan and kind != "blind"):
             raise RapidError(
                 f"Unknown scripted driver '{name}'{did_you_mean(name, SCRIPTED)} Choose one of {', '.join(SCRIPTED)}."
             )
         self.name = name
         self._lanes = lanes
         self._seed = stream_seed(seed, f"teacher/{name}")
+        self.plan = (read_plan(plan) if plan else plan_for(scenario)) if kind == "blind" else None
 
     def describe(self) -> dict[str, Any]:
         """Return the driver's identity."""
-        return {"backend": "scripted", "model": self.name}
+        return {"backend": "scripted", "model": self.name} | ({"plan": list(self.plan)} if self.plan else {})
 
     def decide(
         self,
@@ -49,7 +61,10 @@ class Scripted:
         """Decide for each world; see :meth:`rapid.teacher.decision.Teacher.decide`."""
         start = time.perf_counter()
         scenes = read_scenes(obs_BVF, self._lanes)
-        chosen = [self._choose(scene, keys_B, world) for world, scene in enumerate(scenes)]
+        if self.plan is not None:
+            chosen = [_follow(self.plan, before) for before in previous]
+        else:
+            chosen = [self._choose(scene, keys_B, world) for world, scene in enumerate(scenes)]
         seconds = (time.perf_counter() - start) / max(len(chosen), 1)
         return [
             Decision(action, explanation, probabilities=probabilities, seconds=seconds)
@@ -61,6 +76,8 @@ class Scripted:
     ) -> tuple[int, str, tuple[float, ...] | None]:
         if self.name in _CONSTANTS:
             return _CONSTANTS[self.name], "", None
+        if self.name == "immune":
+            return (SLOWER, "another car is there", None) if scene.cars else (FASTER, "no car is there", None)
         if self.name in _RULES:
             action, explanation = _RULES[self.name](gather(scene))
             return action, explanation, None
@@ -117,6 +134,64 @@ _RULES: dict[str, Callable[[Facts], tuple[int, str]]] = {
     "rule-forecast": _forecast_rule,
     "rule-foresight": _foresight_rule,
 }
-SCRIPTED = ("random", *_CONSTANTS, *_RULES, "uniform-safe")
+SCRIPTED = ("random", *_CONSTANTS, *_RULES, "uniform-safe", "immune", "blind")
 """`rule` uses the closed-form checks, `rule-forecast` the forecast, `rule-foresight` the best ways on, from which
-`uniform-safe` draws one as good as any."""
+`uniform-safe` draws one as good as any; `immune` brakes while any other car is present and speeds up while none is;
+`blind` follows a fixed plan whatever it sees."""
+
+PLANS = Path(__file__).with_name("blind.json")
+"""The plans of `blind`, as :mod:`rapid.evaluation.blind` found them."""
+Plan = tuple[int, int, int]
+"""How often SLOWER, then LANE_RIGHT, then FASTER; after that IDLE."""
+
+
+def read_plan(text: str) -> Plan:
+    """Return a plan written as in ``5,2,4``.
+
+    Raises:
+        RapidError: it is not three whole numbers of at least 0.
+    """
+    words = [word.strip() for word in text.split(",")]
+    if len(words) != 3 or not all(word.isascii() and word.isdigit() for word in words):
+        raise RapidError(
+            f"A plan of the driver 'blind' is written blind:5,2,4: how often SLOWER, LANE_RIGHT and FASTER, then IDLE; "
+            f"got '{text}'."
+        )
+    slower, right, faster = map(int, words)
+    return slower, right, faster
+
+
+def _plans() -> dict[str, Any]:
+    return read_json(PLANS, "file of plans")["plans"]
+
+
+def has_plan(scenario: str) -> bool:
+    """Whether `blind` has a plan for a scenario."""
+    return replace(get_scenario(scenario), clock=False).name in _plans()
+
+
+def plan_for(scenario: str) -> Plan:
+    """Return the plan of `blind` for a scenario.
+
+    Raises:
+        RapidError: none was searched for it.
+    """
+    plans = _plans()
+    if scenario:
+        scenario = replace(get_scenario(scenario), clock=False).name
+    if scenario not in plans:
+        raise RapidError(
+            f"The driver 'blind' has no plan for {scenario or 'a road without a name'}, only for {', '.join(plans)}. "
+            f"Search one with `python -m rapid.evaluation.blind {scenario or 'SCENARIO'}` and name it: blind:5,2,4."
+        )
+    slower, right, faster = plans[scenario]["plan"]
+    return slower, right, faster
+
+
+def _follow(plan: Plan, previous: Decision | None) -> tuple[int, str, None]:
+    """Return the next action of the plan. What a driver remembers is its last decision, so that carries the count."""
+    step = 0 if previous is None else int(previous.explanation.rpartition(" ")[2]) + 1
+    slower, right, faster = plan
+    actions = [SLOWER] * slower + [LANE_RIGHT] * right + [FASTER] * faster
+    action = actions[step] if step < len(actions) else IDLE
+    return action, f"decision {step}", None

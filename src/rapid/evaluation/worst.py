@@ -1,0 +1,152 @@
+"""The worst case over attacks: of every spawn the attack after which its episode earned least.
+
+An attacker chooses per spawn, so the mean of the minima lies below the minimum of the means. Only attacks of the same
+size that may move the same things belong together; to do nothing is one of them.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from rapid.attacks.spec import AttackSpec, parse_attack
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import EpisodeRow, column
+from rapid.evaluation.statistics import RESAMPLES, Estimate, estimate
+from rapid.evaluation.summary import aligned, label_of, with_interval
+from rapid.scenarios import get_scenario
+
+UNBOUNDED = ("none", "gaussian")
+"""Kinds of attacks that belong to no ball."""
+
+
+class Threat(NamedTuple):
+    """What an attacker may do: how far each feature may be moved, and which."""
+
+    radius: float
+    metres: float
+    speed: float
+    presence: str
+    ego: str
+
+    def words(self, lanes: int) -> str:
+        """Return it in words, in metres and m/s."""
+        box = bool(self.metres or self.speed)
+        spec = AttackSpec(
+            "lie",
+            radius=0.1 if box else self.radius,
+            metres=self.metres,
+            speed=self.speed,
+            presence="free" if self.presence == "free" else "masked",
+            ego="trusted" if self.ego == "trusted" else "free",
+        )
+        return spec.units(lanes)
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The worst case of one agent in one scenario within one threat."""
+
+    scenario: str
+    agent: str
+    threat: Threat
+    attacks: tuple[str, ...]
+    """Those that were made on it."""
+    rows: tuple[EpisodeRow, ...]
+    """For each training and spawn the episode that earned least; `attack` says under which."""
+    episode_return: Estimate
+    crashed: Estimate
+
+    @property
+    def worst_attack(self) -> str:
+        """The attack that was worst most often."""
+        return Counter(row.attack for row in self.rows).most_common(1)[0][0]
+
+
+def threat_of(attack: str) -> Threat | None:
+    """Return what an attack may do, from its text; None for what has no bound, or is no text of an attack."""
+    try:
+        spec = parse_attack(attack)
+    except RapidError:
+        return None
+    if spec.kind in UNBOUNDED:
+        return None
+    box = bool(spec.metres or spec.speed)
+    return Threat(0.0 if box else spec.radius, spec.metres, spec.speed, spec.presence, spec.ego)
+
+
+def worst_rows(rows: Sequence[EpisodeRow]) -> list[EpisodeRow]:
+    """Return of each scenario, agent, training and spawn the row that earned least; of equal ones the first.
+
+    Their mean return is the worst case: the mean over spawns of the minimum over attacks.
+    """
+    found: dict[tuple[str, str, int | None, int], EpisodeRow] = {}
+    for row in rows:
+        key = (row.scenario, row.agent, row.training_seed, row.seed)
+        if key not in found or row.episode_return < found[key].episode_return:
+            found[key] = row
+    return list(found.values())
+
+
+def worst_cases(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[Worst]:
+    """Return the worst case of every agent within every threat of which at least two attacks were measured.
+
+    An agent on which only some of them can be made is shown with these; spawns that one of them lacks are left out.
+    """
+    threats = {attack: threat_of(attack) for attack in dict.fromkeys(row.attack for row in rows)}
+    members = Counter(threat for threat in threats.values() if threat is not None)
+    found: list[Worst] = []
+    for scenario, agent in dict.fromkeys((row.scenario, row.agent) for row in rows):
+        own = [row for row in rows if (row.scenario, row.agent) == (scenario, agent)]
+        for threat in (threat for threat, count in members.items() if count > 1):
+            chosen = [row for row in own if threats[row.attack] == threat or row.attack == "none"]
+            attacks = tuple(dict.fromkeys(row.attack for row in chosen if row.attack != "none"))
+            if not attacks:
+                continue
+            complete = _measured_under_all(chosen)
+            worst = [row for row in worst_rows(chosen) if (row.training_seed, row.seed) in complete]
+            if worst:
+                found.append(_worst(scenario, agent, threat, attacks, worst, resamples))
+    return found
+
+
+def _measured_under_all(rows: Sequence[EpisodeRow]) -> set[tuple[int | None, int]]:
+    counts = Counter((row.training_seed, row.seed) for row in rows)
+    most = max(counts.values())
+    return {key for key, count in counts.items() if count == most}
+
+
+def _worst(
+    scenario: str, agent: str, threat: Threat, attacks: tuple[str, ...], rows: Sequence[EpisodeRow], resamples: int
+) -> Worst:
+    seeds, trainings = [row.seed for row in rows], [row.training_seed for row in rows]
+    returns, crashes = (
+        estimate(column(rows, name), seeds, trainings, "mean", resamples) for name in ("episode_return", "crashed")
+    )
+    return Worst(scenario, agent, threat, attacks, tuple(rows), returns, crashes)
+
+
+def worst_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
+    """Return the worst cases as aligned plain text, one block for each scenario and threat; empty without any."""
+    blocks: list[str] = []
+    cases = worst_cases(rows, resamples)
+    for scenario, threat in dict.fromkeys((case.scenario, case.threat) for case in cases):
+        here = [case for case in cases if (case.scenario, case.threat) == (scenario, threat)]
+        lines = [["worst case", "return", "crash %", "attacks", "most often"]]
+        lines += [
+            [
+                label_of(case.agent),
+                with_interval(case.episode_return),
+                with_interval(case.crashed, 0, 100),
+                str(len(case.attacks)),
+                case.worst_attack,
+            ]
+            for case in here
+        ]
+        blocks.append(f"{scenario}, within {threat.words(get_scenario(scenario).lanes)}\n{aligned(lines)}")
+    if blocks:
+        blocks.append(
+            "Worst case: the mean over spawns of the least return under any of the attacks, none among them. Agents "
+            "without a network meet fewer attacks, so theirs is an upper bound of what the same attacker could do."
+        )
+    return "\n\n".join(blocks)
