@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import rapid
 from rapid.errors import RapidError, did_you_mean
+from rapid.text import printable
 
 VERBS: dict[str, str] = {
     "run": "do everything: collect, mix, distill, adapt, evaluate, report",
@@ -69,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except RapidError as error:
         if debug:
             raise
-        print(f"rapid: {error}", file=sys.stderr)
+        print(f"rapid: {printable(str(error))}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         if debug:
@@ -83,8 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         if debug:
             raise
+        said = printable(str(error))
         print(
-            f"rapid: The system refused: {error}. Check the path, its permissions and the free space.", file=sys.stderr
+            f"rapid: The system refused: {said}. Check the path, its permissions and the free space.", file=sys.stderr
         )
         raise SystemExit(2) from None
     raise SystemExit(code)

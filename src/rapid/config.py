@@ -36,15 +36,18 @@ class TeacherConfig:
     `local` model that converses calculates in 8 bits where the processor is fast at that (AVX-512 VNNI), so its answers
     may differ between processors."""
     base_url: str = "http://127.0.0.1:8000/v1"
-    """Address of the OpenAI-compatible server (`endpoint`)."""
+    """Address of the OpenAI-compatible server (`endpoint`). ``${NAME}`` in it stands for an environment variable, which
+    may hold a secret; a query, as in ``…/gpt-4o?api-version=2024-10-21``, stays at the end."""
     api_key_env: str = "OPENAI_API_KEY"
     """Environment variable that holds the key; the key itself is never written anywhere."""
+    headers_env: str = ""
+    """Environment variable that holds further headers, one a line as ``Name: value``; kept as secret as the key."""
     concurrency: Positive = 8
     """Requests in flight at once (`endpoint`)."""
     requests_per_minute: Amount = 0.0
     """Upper bound on requests per minute; 0 is no bound (`endpoint`)."""
     timeout_s: AboveZero = 60.0
-    """Seconds to wait for one answer (`endpoint`)."""
+    """Seconds that one answer may take, from the request to its last byte (`endpoint`)."""
     max_retries: Count = 4
     """Tries after the first for a failed request, with backoff (`endpoint`)."""
     tool_calling: Literal["auto", "native", "text"] = "auto"

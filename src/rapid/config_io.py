@@ -100,6 +100,10 @@ def validate(config: Config) -> Config:
     Raises:
         RapidError: the first setting that does not, with what was expected.
     """
+    from rapid.teacher.address import check_names
+
+    # First: what looks like a key must not be repeated by any message.
+    check_names(config.teacher)
     check_bounds(config)
     get_scenario(config.scenario)
     if config.adapt.scenario:

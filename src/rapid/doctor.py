@@ -6,7 +6,7 @@ import platform
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from rapid.config import TeacherConfig
@@ -143,20 +143,20 @@ def _extras() -> Finding:
 
 
 def _endpoint(teacher: TeacherConfig) -> Finding:
-    import openai
+    from rapid.teacher.chat import ChatError
+    from rapid.teacher.endpoint import Endpoint
 
-    key = os.environ.get(teacher.api_key_env)
     try:
-        with openai.OpenAI(base_url=teacher.base_url, api_key=key or "none", timeout=10, max_retries=0) as client:
-            names = [model.id for model in client.models.list()]
-    except openai.AuthenticationError:
-        fix = f"Put a valid key into the environment variable {teacher.api_key_env}."
-        return Finding("endpoint", "failed", f"{teacher.base_url} refuses the key", fix)
-    except openai.OpenAIError as error:
+        names = Endpoint(replace(teacher, timeout_s=min(teacher.timeout_s, 10.0), max_retries=0)).models()
+    except ChatError as error:
         fix = "Is the server running, and does its address end in /v1? Set --teacher.base-url."
-        return Finding("endpoint", "failed", f"{teacher.base_url}: {type(error).__name__}", fix)
+        return Finding("endpoint", "failed", f"{teacher.base_url}: {error}", fix)
+    if not names:
+        return Finding(
+            "endpoint", "warning", f"{teacher.base_url} answers, but lists no models", "A run will show more."
+        )
     if teacher.model not in names:
-        near = ", ".join(names[:5]) or "none"
         fix = "Set --teacher.model to one of the server's models."
-        return Finding("endpoint", "warning", f"{teacher.base_url} lists no '{teacher.model}' (it has: {near})", fix)
+        some = ", ".join(names[:5])
+        return Finding("endpoint", "warning", f"{teacher.base_url} lists no '{teacher.model}' (it has: {some})", fix)
     return Finding("endpoint", "ok", f"{teacher.base_url} serves {teacher.model}")

@@ -11,6 +11,8 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from rapid.text import printable
+
 SECONDS_BETWEEN_LINES = 5.0
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 
@@ -100,8 +102,12 @@ def task(title: str, total: float, unit: str, stream: TextIO | None = None) -> G
 
 
 def warn(text: str) -> None:
-    """Say on standard error what went otherwise than a user would expect, and is dealt with."""
-    print(f"rapid: {text}", file=sys.stderr, flush=True)
+    """Say on standard error what went otherwise than a user would expect, and is dealt with.
+
+    It is one line, and control characters in it are shown, not obeyed.
+    """
+    line = printable(text).replace("\n", " ")
+    print(f"rapid: {line}", file=sys.stderr, flush=True)
 
 
 def _shown(amount: float) -> str:

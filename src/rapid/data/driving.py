@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from rapid.data.dataset import Dataset
 from rapid.data.fallbacks import TooManyFallbacksError, check_share, is_fallback
@@ -21,8 +22,16 @@ from rapid.errors import RapidError
 from rapid.progress import Task
 from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
 from rapid.seeding import stream_seed
-from rapid.teacher.decision import Decision, Teacher, UnreachableError
+from rapid.teacher.decision import (
+    Decision,
+    InterruptedDecisions,
+    Teacher,
+    Timed,
+    UnfinishedError,
+    UnreachableError,
+)
 from rapid.teacher.experience import MEMORY_FILE, Experience
+from rapid.teacher.patience import StoppedError
 
 MakeWorlds = Callable[[int], Any]
 """Gives a vector environment of so many worlds, in which a finished world waits for the others."""
@@ -97,6 +106,8 @@ class Collecting:
         for experience in self.hindsight.experiences:
             self._charge(experience)
         self.start = time.monotonic()
+        if budget.seconds and isinstance(teacher, Timed):
+            teacher.end_by(self.start + budget.seconds, f"The budget of {budget.seconds:g} seconds was spent")
         if progress:
             progress.skip(self.count)
 
@@ -111,7 +122,7 @@ class Collecting:
             while self.parts.episodes < len(self.seeds) if target is None else self.count < target:
                 self._collect_group(len(self.parts), self.work / JOURNAL_FILE, worlds, None, target, lockstep)
                 self._look_back()
-        except SpentError as spent:
+        except (SpentError, StoppedError) as spent:
             return str(spent)
         finally:
             worlds.close()
@@ -176,14 +187,7 @@ class Collecting:
             if decisions is None:
                 self._check_budget(len(active))
                 keys = np.array([stream_seed(seeds[world], f"step/{step}") for world in active], np.int64)
-                try:
-                    decisions = self.teacher.decide(seen, [previous[world] for world in active], keys)
-                except UnreachableError:
-                    # What the rule decided just before, while the server was already gone, is asked again.
-                    journal.forget_end(lambda decision: decision.unanswered)
-                    raise
-                journal.append(seen, decisions)
-                self.fresh += len(decisions)
+                decisions = self._decide(seen, [previous[world] for world in active], keys, journal)
             self._count(decisions)
             try:
                 check_share(self.fallbacks, self.decisions, self.budget.fallback_share, self.last_fallback)
@@ -213,6 +217,35 @@ class Collecting:
             step += 1
             self._show(len(decisions))
         return self._table(sorted(steps, key=lambda row: row["world"]), seeds, first)
+
+    def _decide(
+        self,
+        seen: NDArray[np.float32],
+        previous: list[Decision | None],
+        keys: NDArray[np.int64],
+        journal: Journal,
+    ) -> list[Decision]:
+        """Let the teacher decide for all, and write it down, also if it is broken off: answers are paid for."""
+        decisions = journal.kept(len(seen))
+        wanted = [place for place, decision in enumerate(decisions) if decision is None]
+        made: Sequence[Decision | None] = []
+        try:
+            made = self.teacher.decide(seen[wanted], [previous[place] for place in wanted], keys[wanted])
+        except (UnfinishedError, InterruptedDecisions) as broken_off:
+            made = [None if decision and decision.unanswered else decision for decision in broken_off.decisions]
+            raise
+        except UnreachableError:
+            # What the rule decided just before, while the server was already gone, is asked again.
+            journal.forget_end(lambda decision: decision.unanswered)
+            raise
+        finally:
+            for place, decision in zip(wanted, made, strict=False):
+                decisions[place] = decision
+            fresh = sum(decision is not None for decision in made)
+            if fresh:
+                journal.append(seen, decisions)
+                self.fresh += fresh
+        return [decision for decision in decisions if decision is not None]
 
     def _look_back(self) -> None:
         """Let a teacher that reflects learn from the finished episodes, once from each."""

@@ -45,6 +45,7 @@ class Journal:
         if good < len(content):
             truncate(path, good)
         self._next = 1
+        self._kept: list[Decision | None] = []
         self._stream = AppendedFile(path)
 
     @property
@@ -61,27 +62,39 @@ class Journal:
     def recall(self, obs_BVF: NDArray[np.float32]) -> list[Decision] | None:
         """Return the recorded decisions for these observations, or None where the record ends.
 
+        What was decided of a step that was broken off is left for :meth:`kept`.
+
         Raises:
             RapidError: the decisions were made for other observations.
         """
-        if self._next >= len(self._lines):
-            return None
-        record = self._lines[self._next]
-        if record["seen"] != _checksum(obs_BVF):
-            raise RapidError(
-                f"Line {self._next + 1} of '{self.path}' was decided for other observations than the simulator gives "
-                "now: its version or this machine's arithmetic has changed. Delete the file to decide the group anew."
-            )
-        self._next += 1
-        return [from_record(decision) for decision in record["decisions"]]
+        self._kept = []
+        while self._next < len(self._lines):
+            record = self._lines[self._next]
+            if record["seen"] != _checksum(obs_BVF):
+                raise RapidError(
+                    f"Line {self._next + 1} of '{self.path}' was decided for other observations than the simulator "
+                    "gives now: its version or this machine's arithmetic has changed. Delete the file to decide the "
+                    "group anew."
+                )
+            self._next += 1
+            self._kept = [decision and from_record(decision) for decision in record["decisions"]]
+            decisions = [decision for decision in self._kept if decision is not None]
+            if len(decisions) == len(self._kept):
+                return decisions
+        return None
 
-    def append(self, obs_BVF: NDArray[np.float32], decisions: Sequence[Decision]) -> None:
-        """Write the decisions for these observations, on the disk before it returns."""
-        record = {"seen": _checksum(obs_BVF), "decisions": [to_record(decision) for decision in decisions]}
+    def kept(self, count: int) -> list[Decision | None]:
+        """Return what :meth:`recall` found of the step that was broken off; None is still to be decided."""
+        return self._kept or [None] * count
+
+    def append(self, obs_BVF: NDArray[np.float32], decisions: Sequence[Decision | None]) -> None:
+        """Write the decisions for these observations, on the disk before it returns; None if one was not made."""
+        made = [decision for decision in decisions if decision is not None]
+        record = {"seen": _checksum(obs_BVF), "decisions": [decision and to_record(decision) for decision in decisions]}
         self._lines.append(record)
         self._next += 1
         # What the system holds outlives the process; only a power cut could take it. Sync what took long to get.
-        self._write(record, sync=sum(decision.seconds for decision in decisions) > _SYNC_AFTER_SECONDS)
+        self._write(record, sync=sum(decision.seconds for decision in made) > _SYNC_AFTER_SECONDS)
 
     def forget_from(self, unwanted: Callable[[Decision], bool]) -> None:
         """Remove the first step with an unwanted decision and all steps after it: they are decided anew."""

@@ -132,7 +132,9 @@ def make_model_teacher(config: TeacherConfig, lanes: int, seed: int) -> Teacher:
     if config.backend == "endpoint":
         from rapid.teacher.endpoint import Endpoint
 
-        return ConversingTeacher(Endpoint(config), config, {**identity, "base_url": config.base_url}, lanes, memory)
+        endpoint = Endpoint(config)
+        identity = {**identity, "base_url": config.base_url}
+        return ConversingTeacher(endpoint, config, identity, lanes, memory, endpoint.greet)
     from rapid.teacher.local import LocalChat, LocalModel
     from rapid.teacher.models import dense_folder
 

@@ -1,11 +1,14 @@
 """How a model is asked: one conversation at a time, from threads, or many conversations at once, in lockstep."""
 
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from rapid.progress import format_seconds, warn
 from rapid.teacher.logprobs import Token
+from rapid.teacher.patience import Patience, StoppedError
 
 Message = dict[str, Any]
 
@@ -42,6 +45,10 @@ class Reply:
     """What the model thought aloud, where the server tells it apart from `text`; never part of the answer."""
     finish_reason: str = ""
     """Why the answer ended, in the server's word: `stop`, `length` if it was cut off, or another."""
+    model: str = ""
+    """The model's own name, as a server tells it."""
+    estimated: bool = False
+    """Whether the numbers of tokens are guesses, because a server tells none that make sense."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +103,15 @@ T = TypeVar("T")
 Conversation = Generator[Request, Reply | ChatError, T]
 """Yields what it asks, is sent the answer or what went wrong, and returns what came of it."""
 
+_LOOK = 0.2
+"""Seconds between two looks whether there is something to say about the wait."""
 
-def converse(conversations: Sequence[Conversation[T]], chat: Chat | BatchChat, concurrency: int) -> Iterator[T]:
+
+def converse(conversations: Sequence[Conversation[T]], chat: Chat | BatchChat, concurrency: int) -> Iterator[T | None]:
     """Lead conversations to their ends: all together if the chat can, else `concurrency` at once, each in a thread.
 
-    What came of them is given in their order, each as soon as it and those before it have ended.
+    What came of them is given in their order, each as soon as it and those before it have ended; None stands for one
+    that was broken off, because the time was over or the user interrupted. See :func:`attend`.
     """
     if isinstance(chat, BatchChat):
         try:
@@ -113,8 +124,58 @@ def converse(conversations: Sequence[Conversation[T]], chat: Chat | BatchChat, c
         [result] = _in_lockstep([conversation], lambda requests: [_answer(chat, request) for request in requests])
         return result
 
-    with ThreadPoolExecutor(max(concurrency, 1)) as pool:
-        yield from pool.map(alone, conversations)
+    yield from attend([partial(alone, conversation) for conversation in conversations], patience_of(chat), concurrency)
+
+
+def patience_of(chat: Any) -> Patience:
+    """Return how long a chat waits; one that asks no server has a patience that nothing tries."""
+    patience = getattr(chat, "patience", None)
+    return patience if isinstance(patience, Patience) else Patience()
+
+
+def attend(jobs: Sequence[Callable[[], T]], patience: Patience, concurrency: int = 1) -> Iterator[T | None]:
+    """Do jobs that wait for a server, `concurrency` at once, and give what came of each in their order, or None.
+
+    A line says what is waited for if that takes long. The first KeyboardInterrupt lets the requests under way end and
+    begins no others, the second lets them go; it is raised again when all that came has been given.
+    """
+    interrupted = False
+    pool = ThreadPoolExecutor(max(concurrency, 1))
+    try:
+        futures = [pool.submit(job) for job in jobs]
+        for future in futures:
+            while True:
+                try:
+                    wait([future], _LOOK)
+                    if future.done():
+                        break
+                    if word := patience.word():
+                        warn(word)
+                except KeyboardInterrupt:
+                    if interrupted:
+                        patience.drop()
+                        continue
+                    interrupted = True
+                    patience.stop()
+                    count, seconds = patience.under_way()
+                    if count:
+                        warn(
+                            f"Interrupted: {count} {'request' if count == 1 else 'requests'} under way to "
+                            f"{patience.name} {'is' if count == 1 else 'are'} waited for, at most "
+                            f"{format_seconds(seconds)}, as they are paid for. Ctrl-C again does not wait."
+                        )
+            try:
+                result = future.result()
+            except StoppedError:
+                result = None
+            yield result
+        if interrupted:
+            raise KeyboardInterrupt
+    finally:
+        # On the way out by an error, nothing that is still under way matters any more.
+        patience.drop()
+        pool.shutdown(wait=True, cancel_futures=True)
+        patience.renew()
 
 
 def _in_lockstep(

@@ -9,7 +9,7 @@ Each conversation is a generator that yields what it asks (:func:`rapid.teacher.
 import dataclasses
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -18,16 +18,29 @@ from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
 from rapid.errors import sentence
+from rapid.progress import warn
 from rapid.scenarios import IDLE
 from rapid.teacher.answers import EXPLANATION_LIMIT, Choice, read_choice, spoken
 from rapid.teacher.briefing import DECISION_SCHEMA, briefing, repair_request, tool_result
 from rapid.teacher.calls import read_call
-from rapid.teacher.chat import BatchChat, Chat, ChatError, Conversation, Message, Reply, Request, converse
-from rapid.teacher.decision import NO_ANSWER, Decision, UnreachableError
+from rapid.teacher.chat import (
+    BatchChat,
+    Chat,
+    ChatError,
+    Conversation,
+    Message,
+    Reply,
+    Request,
+    attend,
+    converse,
+    patience_of,
+)
+from rapid.teacher.decision import NO_ANSWER, Decision, InterruptedDecisions, UnfinishedError, UnreachableError
 from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts, gather, safest
 from rapid.teacher.logprobs import Token, action_probabilities
 from rapid.teacher.memory import Episode, Memory, identify, show
+from rapid.teacher.patience import StoppedError
 from rapid.teacher.prompt import Prompt, outcome
 from rapid.teacher.reflection import (
     LESSON_SCHEMA,
@@ -72,7 +85,8 @@ def _opening(prompt: Prompt) -> list[Message]:
 class ConversingTeacher:
     """Asks a chat model about many worlds at once; reminds it of similar situations, if there is a memory.
 
-    `memory` is only read. It implements :class:`rapid.teacher.memory.Reflective` too.
+    `memory` is only read. `greet` looks whether the model's server is there; then one decision is asked for before any
+    that counts. It implements :class:`rapid.teacher.memory.Reflective` too.
     """
 
     def __init__(
@@ -82,12 +96,14 @@ class ConversingTeacher:
         identity: dict[str, Any],
         lanes: int,
         memory: Memory | None = None,
+        greet: Callable[[], None] | None = None,
     ) -> None:
         shots = f", {config.few_shot}-shot" if config.few_shot else ""
         self.name = f"{config.model} ({config.style}{shots})"
         self.memory, self.reflects = memory or Memory(), config.reflect
         self._chat, self._config, self._identity, self._lanes = chat, config, identity, lanes
         self._failures = 0
+        self._greet, self._patience = greet, patience_of(chat)
 
     def describe(self) -> dict[str, Any]:
         """Return the teacher's identity."""
@@ -110,10 +126,13 @@ class ConversingTeacher:
         Raises:
             RapidError: also if the server refuses the key or the model.
             UnreachableError: the server seems to be down.
+            UnfinishedError: the time set by :meth:`end_by` was over before.
+            InterruptedDecisions: the user interrupted.
         """
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
+        self._get_ready()
         start = time.perf_counter()
-        decisions = list(self._lead([self._decide(*given) for given in zip(all_facts, previous, strict=True)]))
+        decisions = self._all_of([self._decide(*given) for given in zip(all_facts, previous, strict=True)])
         if isinstance(self._chat, BatchChat):
             seconds = (time.perf_counter() - start) / max(len(decisions), 1)
             decisions = [dataclasses.replace(decision, seconds=seconds) for decision in decisions]
@@ -123,11 +142,52 @@ class ConversingTeacher:
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
         """Give one experience for each episode; see :class:`rapid.teacher.memory.Reflective`."""
-        for experience, fault in self._lead([self._look_back(episode) for episode in episodes]):
+        for result in self._lead([self._look_back(episode) for episode in episodes]):
+            if result is None:
+                raise StoppedError(self._patience.reason)
+            experience, fault = result
             self._watch(fault)
             yield experience
 
-    def _lead(self, conversations: Sequence[Conversation[T]]) -> Iterator[T]:
+    def end_by(self, moment: float, reason: str) -> None:
+        """Wait for nothing beyond `moment`; see :class:`rapid.teacher.decision.Timed`."""
+        self._patience.end_by(moment, reason)
+
+    def _get_ready(self) -> None:
+        """Before anything is driven, look whether the server is there and answers a question."""
+        if self._greet is None:
+            return
+        for _ in attend([self._greet], self._patience):
+            self._patience.check()
+        facts = gather(read_scenes(np.zeros((1, 1, 5), np.float32), self._lanes)[0])
+        [decision] = self._lead([self._decide(facts, None)])
+        if decision is None:
+            raise StoppedError(self._patience.reason)
+        if decision.unanswered:
+            raise UnreachableError(
+                f"{self._patience.name} was asked for one decision: {sentence(decision.error)} Nothing was driven. Are "
+                "address, model and key right?"
+            )
+        self._greet = None
+        if decision.status == "fallback":
+            warn(
+                f"{self._patience.name} was asked for one decision before driving, and its answer was none. "
+                f"{sentence(decision.error)} It said: {decision.answer[:200]!r}"
+            )
+
+    def _all_of(self, conversations: Sequence[Conversation[Decision]]) -> list[Decision]:
+        """Return what came of all conversations; whoever breaks them off is handed what came until then."""
+        made: list[Decision | None] = []
+        try:
+            made.extend(self._lead(conversations))
+        except KeyboardInterrupt:
+            raise InterruptedDecisions([*made, *[None] * (len(conversations) - len(made))]) from None
+        decisions = [decision for decision in made if decision is not None]
+        if len(decisions) < len(made):
+            raise UnfinishedError(self._patience.reason, made)
+        return decisions
+
+    def _lead(self, conversations: Sequence[Conversation[T]]) -> Iterator[T | None]:
         return converse(conversations, self._chat, self._config.concurrency)
 
     def _watch(self, fault: str) -> None:

@@ -5,13 +5,14 @@ import json
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
 from rapid.scenarios import ACTIONS, NUM_ACTIONS
+from rapid.teacher.patience import StoppedError
 
 Status = Literal["ok", "repaired", "fallback", "scripted"]
 STATUSES: tuple[str, ...] = typing.get_args(Status)
@@ -21,6 +22,22 @@ NO_ANSWER = "no answer"
 
 class UnreachableError(RapidError):
     """The model's server gives no answers; what was decided meanwhile was decided by nobody who was asked."""
+
+
+class UnfinishedError(StoppedError):
+    """The time was over before all worlds were decided for; `decisions` holds those that were, and None."""
+
+    def __init__(self, message: str, decisions: Sequence["Decision | None"]) -> None:
+        super().__init__(message)
+        self.decisions = decisions
+
+
+class InterruptedDecisions(KeyboardInterrupt):
+    """The user interrupted; `decisions` holds those that were made all the same, and None for the others."""
+
+    def __init__(self, decisions: Sequence["Decision | None"]) -> None:
+        super().__init__()
+        self.decisions = decisions
 
 
 @dataclass(frozen=True)
@@ -88,6 +105,18 @@ class Teacher(Protocol):
 
         Raises:
             RapidError: an observation of the wrong shape or with a number that is not finite.
+        """
+        ...
+
+
+@runtime_checkable
+class Timed(Protocol):
+    """A teacher that waits for others."""
+
+    def end_by(self, moment: float, reason: str) -> None:
+        """Wait for nothing beyond `moment` (of :func:`time.monotonic`); `reason` is a sentence.
+
+        A call of :meth:`Teacher.decide` that is not done by then raises :class:`UnfinishedError`.
         """
         ...
 

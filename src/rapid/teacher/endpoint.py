@@ -1,67 +1,92 @@
 """Any OpenAI-compatible server: hosted models, vLLM, Ollama, llama-server.
 
 The key is read from the environment when the client is made and appears nowhere else; it is cut out of everything
-that a server says, because servers echo it. What a server does not support (token probabilities, output schema,
-tools) is found out by its refusal and left out from then on.
+that a server says, because servers echo it. What a server does not take is found out by its refusal, given up step by
+step (:mod:`rapid.teacher.dialect`), and told once.
 """
 
+import dataclasses
 import json
-import logging
-import math
-import os
 import random
 import threading
 import time
-from collections.abc import Sequence
-from typing import Any
-from urllib.parse import quote, urlsplit
-
-import openai
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
-from rapid.teacher.chat import ChatError, Message, Reply, Request, ToolCall
-from rapid.teacher.logprobs import TOP, Token
+from rapid.progress import format_seconds, warn
+from rapid.teacher.address import open_access
+from rapid.teacher.chat import ChatError, Reply, Request
+from rapid.teacher.completion import (
+    FormError,
+    Refusal,
+    decode,
+    find_refusal,
+    read_names,
+    read_refusal,
+    read_reply,
+)
+from rapid.teacher.dialect import Dialect, Step, differences, features, steps, without_probabilities, write
+from rapid.teacher.patience import FIRST_WORD, Patience, StoppedError
+from rapid.teacher.secrets import Secrets
+from rapid.teacher.wire import WireError, exchange
+
+T = TypeVar("T")
 
 LONGEST_WAIT = 60.0
-"""Seconds; a server that asks for a longer pause is obeyed up to this."""
-SHORTEST_KEY = 8
-"""Characters from which on a key is taken to be a secret."""
-ERROR_LIMIT = 300
-"""Characters of an error that are kept."""
+"""Seconds; a server that asks for a longer pause is not waited for."""
+LOADING_WAIT = 600.0
+"""Seconds that a server may take to load its model."""
+_LOADING_LOOK = 1.0
+"""Seconds between two looks whether it has."""
+_BETWEEN_LINES = 10.0
+"""Seconds between two lines on a pause."""
+
+
+class _RefusedError(Exception):
+    """The server does not take the request as it is."""
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(f"HTTP {refusal.status}: {refusal.said}")
+        self.refusal = refusal
+        self.words = f"{refusal.said} {refusal.parameter} {refusal.code}"
+
+
+class _PassingError(Exception):
+    """Something that another try may cure."""
+
+    def __init__(self, message: str, refusal: Refusal | None = None) -> None:
+        super().__init__(message)
+        self.refusal = refusal
+        self.loading = refusal is not None and refusal.status == 503 and "load" in refusal.said.lower()
 
 
 class Endpoint:
     """A chat model behind an address; implements :class:`rapid.teacher.chat.Chat`. Safe to use from threads.
 
     Args:
-        config: address, model, key variable, time limit, retries and rate.
+        config: address, model, variables of key and headers, time limit, retries and rate.
         first_wait: seconds before the first retry; each later wait is twice as long.
 
     Raises:
-        RapidError: the address is none, or holds a password. No request is made yet.
+        RapidError: the address is none or holds a secret, or a variable that it needs is not set. No request is made.
     """
 
     def __init__(self, config: TeacherConfig, first_wait: float = 1.0) -> None:
         self._config, self._first_wait = config, first_wait
-        _check_address(config.base_url)
-        key = os.environ.get(config.api_key_env, "").strip()
-        # What people give to servers that want none ("x", "EMPTY") hides nothing, and may occur in any answer.
-        self._secret = key if len(key) >= SHORTEST_KEY else ""
-        try:
-            # Own retries: the client's cannot be counted. Local servers need no key, but the client insists on one.
-            self._client = openai.OpenAI(
-                base_url=config.base_url, api_key=key or "none", timeout=config.timeout_s, max_retries=0
-            )
-        except (openai.OpenAIError, ValueError) as error:
-            raise RapidError(f"The address '{config.base_url}' cannot be used: {self._clean(error)}.") from None
-        # Their debug log holds every header of a response, where a server may repeat the key.
-        for transport in ("httpcore", "httpcore2"):
-            logging.getLogger(transport).setLevel(logging.INFO)
-        self._tools = config.tool_calling != "text"
-        self._schema = self._logprobs = True
-        self._lock = threading.Lock()
-        self._next_slot = 0.0
+        access = open_access(config)
+        self._address, self._headers = access.address, dict(access.headers)
+        self._clean = Secrets(access.secrets).clean
+        self.patience = Patience(config.base_url)
+        # A token with the probabilities of twenty others takes some two thousand characters.
+        self._most_bytes = max(2 << 20, config.max_answer_tokens << 12)
+        self._dialect = Dialect(tools=config.tool_calling != "text")
+        self._proven: set[frozenset[str]] = set()
+        self._told: set[str] = set()
+        self._lock, self._adapting = threading.Lock(), threading.Lock()
+        self._next_slot = self._next_line = 0.0
+        self._end: RapidError | None = None
 
     def __repr__(self) -> str:
         """Name the address and the model, never the key."""
@@ -70,84 +95,225 @@ class Endpoint:
     @property
     def native_tools(self) -> bool:
         """Whether tools are passed beside the messages."""
-        return self._tools
+        return self._dialect.tools
+
+    def models(self) -> tuple[str, ...]:
+        """Return the names of the models that the server lists, none if it has no list; it may load its model first.
+
+        Raises:
+            ChatError: it gave no answer.
+            RapidError: it refuses the key, or its address.
+        """
+
+        def once() -> tuple[str, ...]:
+            try:
+                return read_names(self._exchange("GET", "models", b""), self._clean)
+            except (_RefusedError, FormError):
+                return ()
+
+        return self._tried(once, [0])
+
+    def greet(self) -> None:
+        """Look whether the server is there and has the model, before anything is driven.
+
+        Raises:
+            RapidError: it gives no answer, or refuses the key.
+        """
+        try:
+            names = self.models()
+        except ChatError as error:
+            raise RapidError(
+                f"The model's server {self._config.base_url} gives no answer: {error}. Nothing was driven. Is it "
+                "running, and is --teacher.base-url its address?"
+            ) from None
+        if names and self._config.model not in names:
+            some = ", ".join(names[:5])
+            self._tell(f"It lists no model '{self._config.model}' (but: {some}); it is asked for it all the same.")
 
     def ask(self, request: Request) -> Reply:
         """Answer a conversation, with bounded retries; see :class:`rapid.teacher.chat.Chat`."""
-        retries = 0
-        while True:
-            options = self._options(request)
-            self._wait_for_slot()
+        dialect, retries = self._dialect, [0]
+        try:
             try:
-                return self._read(self._request(request.messages, options), retries)
-            except (openai.AuthenticationError, openai.PermissionDeniedError) as error:
-                raise RapidError(
-                    f"{self._config.base_url} refuses the key: {self._clean(error)}. Put a valid key into the "
-                    f"environment variable {self._config.api_key_env}."
-                ) from None
-            except openai.NotFoundError as error:
-                raise RapidError(
-                    f"{self._config.base_url} does not know the model '{self._config.model}', or is no OpenAI-style "
-                    f"address: {self._clean(error)}. Check --teacher.model and --teacher.base-url."
-                ) from None
-            except (openai.BadRequestError, openai.UnprocessableEntityError) as error:
-                if not options or not self._give_up_an_option(options):
-                    raise ChatError(f"the request was refused: {self._clean(error)}", retries) from None
-            except (openai.APIError, ValueError) as error:
-                if retries >= self._config.max_retries:
-                    raise ChatError(f"{type(error).__name__}: {self._clean(error)}", retries) from None
-                time.sleep(self._pause(error, retries))
-                retries += 1
+                return self._ask(request, dialect, retries)
+            except _RefusedError as refused:
+                # One thread finds out what it is; those that wait here may find it known already.
+                with self._adapting:
+                    return self._adapt(request, dialect, refused, retries)
+        except StoppedError:
+            raise
+        except RapidError as error:
+            # No further request would change it, and none is made.
+            self._end = self._end or error
+            raise
 
-    def _options(self, request: Request) -> dict[str, Any]:
-        options: dict[str, Any] = {}
-        if request.logprobs and self._logprobs:
-            options |= {"logprobs": True, "top_logprobs": TOP}
-        if request.tools and self._tools:
-            options["tools"] = request.tools
-        if request.schema and self._schema:
-            described = {"name": "decision", "schema": request.schema, "strict": True}
-            options["response_format"] = {"type": "json_schema", "json_schema": described}
-        return options
+    def _ask(self, request: Request, dialect: Dialect, retries: list[int]) -> Reply:
+        """Ask in one dialect, and count the retries."""
+        if self._end is not None:
+            raise self._end
+        most = self._config.max_answer_tokens
+        body = json.dumps(write(dialect, request, self._config.model, most)).encode()
+        offered = bool(request.tools and dialect.tools)
 
-    def _request(self, messages: Sequence[Message], options: dict[str, Any]) -> Any:
-        sent: list[Any] = list(messages)
-        return self._client.chat.completions.create(
-            model=self._config.model,
-            messages=sent,
-            temperature=0.0,
-            max_tokens=self._config.max_answer_tokens,
-            **options,
-        )
+        def once() -> Reply:
+            return read_reply(self._exchange("POST", "chat/completions", body), len(body), most, offered, self._clean)
 
-    def _read(self, completion: Any, retries: int) -> Reply:
-        """Read an answer without trusting its form: servers answer 200 with all sorts of things."""
-        choices = getattr(completion, "choices", None)
-        if not choices or getattr(choices[0], "message", None) is None:
-            raise ValueError("the server answered without a message")
-        message, usage = choices[0].message, getattr(completion, "usage", None)
-        text = message.content or getattr(message, "refusal", None) or ""
-        calls = tuple(
-            ToolCall(self._clean(call.id), self._clean(call.function.name), self._clean(call.function.arguments))
-            for call in message.tool_calls or ()
-            if getattr(call, "function", None) is not None
-        )
-        tokens_in, tokens_out = getattr(usage, "prompt_tokens", 0) or 0, getattr(usage, "completion_tokens", 0) or 0
-        return Reply(self._clean(text), calls, int(tokens_in), int(tokens_out), retries, _tokens(choices[0]))
-
-    def _give_up_an_option(self, options: dict[str, Any]) -> bool:
-        """Leave out what the server may have refused, the rarest first; say whether there was anything."""
+        used = features(dialect, request)
+        reply = self._tried(once, retries, lambda words: self._names_a_step(words, request, dialect), used)
         with self._lock:
-            if "logprobs" in options:
-                self._logprobs = False
-                return True
-            if "response_format" in options:
-                self._schema = False
-                return True
-            if "tools" in options and self._config.tool_calling == "auto":
-                self._tools = False
-                return True
-        return False
+            self._proven.add(used)
+        if reply.estimated:
+            self._tell("It tells no sensible numbers of tokens: they are estimated, at 4 characters each.")
+        if reply.model and reply.model != self._config.model:
+            self._tell(f"The model that answers calls itself '{reply.model}'.")
+        return dataclasses.replace(reply, retries=retries[0])
+
+    def _names_a_step(self, words: str, request: Request, dialect: Dialect) -> bool:
+        return any(step.is_meant(words) for step in steps(dialect, request, self._config.tool_calling == "auto"))
+
+    def _adapt(self, request: Request, before: Dialect, refused: _RefusedError, retries: list[int]) -> Reply:
+        """Find a dialect in which the server takes a request, giving up what it names, or else one thing after another.
+
+        What turns out to have been no hindrance is taken up again. What was accepted before is given up for this
+        request alone, and only if the server names it: some distribute requests over others of several kinds.
+        """
+        if self._dialect != before:
+            try:
+                return self._ask(request, self._dialect, retries)
+            except _RefusedError as error:
+                refused = error
+        base = dialect = self._dialect
+        known = features(base, request) in self._proven
+        first, given_up = refused, dict[tuple[str, ...], Step]()
+        reply: Reply | None = None
+        while reply is None:
+            possible = list(steps(dialect, request, self._config.tool_calling == "auto"))
+            named = [step for step in possible if step.is_meant(refused.words)]
+            if refused.refusal.status == 403:
+                # What may be forbidden apart from everything else are probabilities.
+                possible = [silent] if (silent := without_probabilities(dialect, request)) else []
+            elif refused.refusal.status == 500:
+                possible = [step for step in possible if step.simpler.system < dialect.system]
+            step = next(iter(named or ([] if known else possible)), None)
+            if step is None:
+                raise self._final(first, retries[0])
+            given_up[differences(dialect, step.simpler)] = step
+            dialect = step.simpler
+            try:
+                reply = self._ask(request, dialect, retries)
+            except _RefusedError as error:
+                refused = error
+        for fields in list(given_up)[:-1]:
+            again = dataclasses.replace(dialect, **{name: getattr(base, name) for name in fields})
+            try:
+                reply = self._ask(request, again, retries)
+            except _RefusedError:
+                continue
+            dialect = again
+            del given_up[fields]
+        if not known:
+            with self._lock:
+                self._dialect = dialect
+            gone = "; ".join(step.told for step in given_up.values())
+            self._tell(f"It refused a request ({first}). From now on: {gone}.")
+        return reply
+
+    def _final(self, refused: _RefusedError, retries: int) -> Exception:
+        """Return the error for a request that the server takes in no form."""
+        if refused.refusal.status == 403:
+            return self._key_error(refused.refusal)
+        what = "" if refused.refusal.status >= 500 else "the request was refused: "
+        return ChatError(f"{what}{refused}", retries)
+
+    def _key_error(self, refusal: Refusal) -> RapidError:
+        return RapidError(
+            f"{self._config.base_url} refuses the key: HTTP {refusal.status}: {refusal.said}. Put a valid key into the "
+            f"environment variable {self._config.api_key_env or 'that --teacher.api-key-env names'}."
+        )
+
+    def _exchange(self, method: str, name: str, body: bytes) -> Mapping[str, Any]:
+        """Make one request and return the object that came."""
+        self._wait_for_slot()
+        with self.patience.flight(self._config.timeout_s) as flight:
+            try:
+                response = exchange(method, self._address, name, self._headers, body, flight, self._most_bytes)
+            except WireError as error:
+                said = self._clean(str(error))
+                raise (ChatError(said) if error.lasting else _PassingError(said)) from None
+        if response.status == 200:
+            answer = decode(response.body, response.headers.get("content-type", ""), self._clean)
+            refusal = find_refusal(answer, response.headers, self._clean)
+            if refusal is None:
+                return answer
+        else:
+            refusal = read_refusal(response.status, response.headers, response.body, self._clean)
+        raise self._fault(refusal, method, self._clean(response.headers.get("location", "")))
+
+    def _fault(self, refusal: Refusal, method: str, location: str) -> Exception:
+        """Return what a refusal means."""
+        status, said = refusal.status, f"HTTP {refusal.status}: {refusal.said}"
+        url = self._config.base_url
+        if status == 401:
+            return self._key_error(refusal)
+        if status in (400, 403, 413, 422, 501) or (status in (404, 405) and method == "GET"):
+            return _RefusedError(refusal)
+        if status in (404, 405):
+            return RapidError(
+                f"{url} does not know the model '{self._config.model}', or is no OpenAI-style address: {said}. Check "
+                "--teacher.model and --teacher.base-url."
+            )
+        if status == 402 or refusal.code in ("insufficient_quota", "billing_hard_limit_reached"):
+            return RapidError(f"{url} wants to be paid first: {said}. What was collected is kept.")
+        if status == 407:
+            variable = self._address.proxy.variable if self._address.proxy else "the proxy"
+            return RapidError(f"The proxy refuses to serve without a password: {said}. Put it into {variable}.")
+        if 300 <= status < 400:
+            return RapidError(f"{url} points elsewhere ({said}): set --teacher.base-url to {location or 'that'}.")
+        if refusal.after is not None and refusal.after > LONGEST_WAIT:
+            pause = format_seconds(refusal.after)
+            return RapidError(f"{url} wants to be left alone for {pause}: {said}. Run the same command again then.")
+        if status in (408, 409, 425, 429) or status >= 500:
+            return _PassingError(said, refusal)
+        return ChatError(said)
+
+    def _tried(
+        self,
+        action: Callable[[], T],
+        retries: list[int],
+        named: Callable[[str], bool] = lambda words: False,
+        used: frozenset[str] = frozenset(),
+    ) -> T:
+        """Do something until it succeeds; wait in between, and for a model that is still loaded."""
+        loaded_by = 0.0
+        while True:
+            try:
+                return action()
+            except ChatError as error:
+                raise ChatError(str(error), retries[0]) from None
+            except (_PassingError, FormError) as error:
+                refusal = error.refusal if isinstance(error, _PassingError) else None
+                # Some call it an error of their own that they cannot write a conversation down for their model.
+                strange = refusal if refusal is not None and refusal.status == 500 else None
+                if strange and named(strange.said):
+                    raise _RefusedError(strange) from None
+                if isinstance(error, _PassingError) and error.loading:
+                    loaded_by = loaded_by or time.monotonic() + LOADING_WAIT
+                    if time.monotonic() < loaded_by:
+                        self._tell(f"It is still loading its model; that may take {format_seconds(LOADING_WAIT)}.")
+                        self.patience.sleep(_LOADING_LOOK)
+                        continue
+                lasting = isinstance(error, FormError) and error.lasting
+                if lasting or retries[0] >= self._config.max_retries:
+                    if strange and used and used not in self._proven:
+                        raise _RefusedError(strange) from None
+                    raise ChatError(str(error), retries[0]) from None
+                pause = self._pause(refusal, retries[0])
+                if pause >= FIRST_WORD:
+                    self._tell_of_pause(
+                        f"{self._config.base_url}: {error}; the next try is in {format_seconds(pause)}."
+                    )
+                self.patience.sleep(pause)
+                retries[0] += 1
 
     def _wait_for_slot(self) -> None:
         """Space requests evenly under the rate limit."""
@@ -157,69 +323,26 @@ class Endpoint:
             now = time.monotonic()
             slot = max(self._next_slot, now)
             self._next_slot = slot + 60.0 / self._config.requests_per_minute
-        time.sleep(slot - now)
+        self.patience.sleep(slot - now)
 
-    def _pause(self, error: Exception, retries: int) -> float:
+    def _pause(self, refusal: Refusal | None, retries: int) -> float:
         """Return the seconds to wait: what the server asks for, else exponential with jitter."""
-        response = getattr(error, "response", None)
-        asked = response.headers.get("retry-after") if response is not None else None
-        try:
-            if asked is not None:
-                return min(max(float(asked), 0.0), LONGEST_WAIT)
-        except ValueError:
-            pass  # a date instead of seconds: the backoff does as well
-        return min(self._first_wait * 2.0**retries * random.uniform(0.5, 1.0), LONGEST_WAIT)
+        if refusal is not None and refusal.after is not None:
+            return min(refusal.after, LONGEST_WAIT)
+        return min(self._first_wait * 2.0 ** min(retries, 20) * random.uniform(0.5, 1.0), LONGEST_WAIT)
 
-    def _clean(self, said: object) -> str:
-        """Return what was said without the key, however it is spelled."""
-        text = str(said)
-        if self._secret:
-            # Quoted as JSON, as Python or as a part of an address; the longest first, so that no rest stays.
-            key = self._secret
-            spellings = {key, json.dumps(key)[1:-1], repr(key)[1:-1], quote(key, safe=""), quote(key)}
-            for spelling in sorted(spellings, key=len, reverse=True):
-                text = text.replace(spelling, "[key]")
-        # Cut after cleaning: a key that is cut in two would not be found.
-        return text[:ERROR_LIMIT] if isinstance(said, Exception) else text
+    def _tell(self, sentence: str) -> None:
+        """Say something about the server, once."""
+        with self._lock:
+            if sentence in self._told:
+                return
+            self._told.add(sentence)
+        warn(f"{self._config.base_url}: {sentence}")
 
-
-def _check_address(address: str) -> None:
-    """Raise unless an address can be one; it is recorded with the data, so that it must not hold a password."""
-    try:
-        parts = urlsplit(address)
-        usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        parts, usable = None, False
-    if parts is not None and "@" in parts.netloc:
-        raise RapidError(
-            "The address in --teacher.base-url holds a user name or password, which would be written into the data. "
-            "Leave it out, and put the key into the environment variable that --teacher.api-key-env names."
-        )
-    if not usable:
-        raise RapidError(
-            f"The address '{address}' cannot be used. Give --teacher.base-url an address such as "
-            "http://127.0.0.1:8000/v1."
-        )
-
-
-def _tokens(choice: Any) -> tuple[Token, ...]:
-    """Read the token probabilities, if the server gave any that make sense."""
-    try:
-        return tuple(
-            Token(
-                str(written.token),
-                tuple(
-                    {str(other.token): _logprob(other) for other in (written, *(written.top_logprobs or ()))}.items()
-                ),
-            )
-            for written in choice.logprobs.content
-        )
-    except (AttributeError, TypeError, ValueError):
-        return ()
-
-
-def _logprob(token: Any) -> float:
-    value = float(token.logprob)
-    if math.isnan(value):
-        raise ValueError("a probability that is no number")
-    return value
+    def _tell_of_pause(self, sentence: str) -> None:
+        with self._lock:
+            now = time.monotonic()
+            if now < self._next_line:
+                return
+            self._next_line = now + _BETWEEN_LINES
+        warn(sentence)
