@@ -86,7 +86,7 @@ def test_lasting_faults_end_in_a_counted_fallback(server, world):
     roles = [[message["role"] for message in request["messages"]] for request in server.requests]
     assert roles == [["system", "user"]] * 3 + [["user"]]
     assert (decision.status, decision.retries) == ("fallback", 2)
-    assert decision.error == "no answer: HTTP 500: no"
+    assert decision.error == "no answer: HTTP 500: no."
 
 
 @pytest.mark.parametrize(
