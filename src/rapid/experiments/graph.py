@@ -148,7 +148,7 @@ def run(
                     path = store.place(cell) / name
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
-            store.finish(cell, result.seconds)
+            store.finish(cell, result.seconds, result.cpu_seconds)
             outcome.computed.append(cell)
             outcome.seconds[kind_of(cell)] = outcome.seconds.get(kind_of(cell), 0.0) + result.seconds
         finally:
@@ -198,23 +198,26 @@ class Result:
     seconds: float
     files: dict[str, bytes] | None = None
     error: str = ""
+    cpu_seconds: float = 0.0
+    """Seconds of processor time, which other work beside it does not lengthen."""
 
 
 def do(job: Job, report: Callable[[Any], None]) -> Result:
     """Compute a cell; a failure is a result, so that the others go on."""
-    start = time.monotonic()
+    start, cpu = time.monotonic(), time.process_time()
     try:
         with quiet():
             if job.packed is None:
                 compute(job.cell, Path(job.place), {name: Path(path) for name, path in job.given.items()})
-                return Result(time.monotonic() - start)
+                return Result(time.monotonic() - start, cpu_seconds=time.process_time() - cpu)
             with tempfile.TemporaryDirectory(prefix="rapid-") as scratch:
                 root = Path(scratch)
                 for name, files in job.packed.items():
                     unpack(root / name, files)
                 (root / "own").mkdir()
                 compute(job.cell, root / "own", {name: root / name for name in job.packed})
-                return Result(time.monotonic() - start, files_of(root / "own"))
+                files = files_of(root / "own")
+                return Result(time.monotonic() - start, files, cpu_seconds=time.process_time() - cpu)
     except RapidError as error:
         return Result(time.monotonic() - start, None, str(error))
     except OSError as error:

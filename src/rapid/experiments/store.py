@@ -83,7 +83,7 @@ class Store:
                 write_json(place / "cell.json", describe(cell))
             yield place
 
-    def finish(self, cell: Cell, seconds: float) -> None:
+    def finish(self, cell: Cell, seconds: float, cpu_seconds: float = 0.0) -> None:
         """Mark a cell as done; what was only needed to resume goes."""
         place = self.place(cell)
         for path in place.rglob(CHECKPOINT_FILE):
@@ -94,6 +94,7 @@ class Store:
             {
                 "cell": describe(cell),
                 "seconds": round(seconds, 3),
+                "cpu_seconds": round(cpu_seconds, 3),
                 **_provenance(),
                 "files": {str(path.relative_to(place)): sha256(path) for path in files},
             },
