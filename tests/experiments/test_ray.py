@@ -3,11 +3,10 @@
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 import pytest
@@ -44,11 +43,12 @@ def rows(store: Store) -> list[list[EpisodeRow]]:
 def test_a_worker_and_a_node_may_die_in_the_middle(cluster: Any, tmp_path: Path):
     node = cluster.add_node(num_cpus=1, object_store_memory=10**8)
     cluster.wait_for_nodes()
-    store, ended = Store(tmp_path / "ray"), []
+    store, ended, done = Store(tmp_path / "ray"), [], Event()
 
     def destroy() -> None:
         while not any(store.is_here(cell) for cell in CELLS):
-            time.sleep(0.1)
+            if done.wait(0.1):
+                return
         workers = subprocess.run(["pgrep", "-f", "ray::_attempt"], capture_output=True, text=True, check=False)
         for pid in workers.stdout.split()[:1]:
             os.kill(int(pid), signal.SIGKILL)
@@ -58,8 +58,11 @@ def test_a_worker_and_a_node_may_die_in_the_middle(cluster: Any, tmp_path: Path)
 
     killer = Thread(target=destroy)
     killer.start()
-    outcome = run(plan(CELLS, store).todo, store, engine="ray", workers=2, say=lambda line: None)
-    killer.join()
+    try:
+        outcome = run(plan(CELLS, store).todo, store, engine="ray", workers=2, say=lambda line: None)
+    finally:
+        done.set()
+        killer.join()
     assert ended[-1] == "node"
     assert not outcome.failed
     assert len(outcome.computed) == len(CELLS)

@@ -222,7 +222,7 @@ def do(job: Job, report: Callable[[Any], None]) -> Result:
         return Result(time.monotonic() - start, None, str(error))
     except OSError as error:
         return Result(time.monotonic() - start, None, f"The system refused: {error}. Make room or check permissions.")
-    except (ArithmeticError, LookupError, TypeError, ValueError, RuntimeError) as error:
+    except Exception as error:  # a fault of the program in one cell is no reason to lose the others
         return Result(time.monotonic() - start, None, f"{type(error).__name__}: {error}")
 
 
