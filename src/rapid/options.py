@@ -274,6 +274,10 @@ class Reproduce:
     """Only say what is done and what is to do."""
     page_only: bool = False
     """Compute nothing: write the page of what is there."""
+    readme: bool = False
+    """Only fill the marked blocks of README.md and docs/ in this checkout from the committed rows."""
+    check: bool = False
+    """Only say whether those blocks are what the committed rows say."""
 
 
 @dataclass(frozen=True)

@@ -226,12 +226,27 @@ def _report(options: Report, config: Config) -> int:
     return 0
 
 
+def _fill_blocks(store: Path, check: bool) -> int:
+    from rapid.experiments.readme import update
+    from rapid.experiments.reproduce import open_reproduction
+
+    stale = update(Path(), open_reproduction((), Config.recipe, "full", store).store, check)
+    told = ", ".join(map(str, stale))
+    if check and stale:
+        print(f"Not what the rows say: {told}. Mend with: rapid reproduce --readme", file=sys.stderr)
+    else:
+        print(f"Filled: {told}." if stale else "Every block is what the rows say.")
+    return int(check and bool(stale))
+
+
 def _reproduce(options: Reproduce, config: Config) -> int:
     from rapid.experiments.exhibits import ALL, cells_of
     from rapid.experiments.reproduce import listing, open_reproduction, reproduce, text_of, write_page
 
     ids = () if options.ids == ("all",) else options.ids
     layers = [Path(layer) for layer in options.layers]
+    if options.readme or options.check:
+        return _fill_blocks(Path(options.store), options.check)
     of = open_reproduction(ids, options.recipe, options.scale, Path(options.store), layers)
     if not options.ids or options.dry_run:
         print(listing(of))

@@ -565,7 +565,7 @@ ALL: dict[str, Exhibit] = {
             "RAPID, its baselines and the floors under the paper's reward.",
             (
                 *("slower", "immune", "blind", "teacher", "offline-dqn", "offline-ddqn", "cql", "bc", "distilled"),
-                *("online-ddqn-10k", "online-ppo", "mlp-ppo", "rapid-10k", "rapid-ppo"),
+                *("online-ddqn-10k", "online-ppo", "mlp-ppo", "rapid-10k", "rapid-ppo", "rapid-robust"),
             ),
             recipes=("strong",),
         ),

@@ -74,9 +74,12 @@ class Setting:
             wanted = max(2, effort.iterations * wanted // OFFLINE_ITERATIONS)
         distill = replace(distill, iterations=wanted, evaluate_every=max(1, wanted // CURVE_POINTS))
         if effort.steps is not None:
-            ppo = replace(adapt.ppo, steps=0)
+            small = preset(self.recipe, "tiny", plan).adapt
             adapt = replace(
-                adapt, steps=effort.steps, ppo=ppo, learning_starts=min(adapt.learning_starts, effort.steps // 4)
+                adapt,
+                steps=effort.steps if adapt.steps else 0,
+                ppo=small.ppo,
+                learning_starts=min(adapt.learning_starts, effort.steps // 4),
             )
         adapt = replace(adapt, scenario=self.scenario, evaluate_every=max(1, adapt.steps // CURVE_POINTS))
         return replace(config, scenario=self.scenario, seed=self.seed, distill=distill, adapt=adapt)
@@ -263,6 +266,12 @@ METHODS: dict[str, Method] = {
         Method("rapid", "RAPID", "learned", lambda s: rapid(s, _paper_data(s)), printed="RAPID"),
         Method("rapid-10k", "RAPID, 10K online", "learned", lambda s: rapid(s, _paper_data(s), plan="careful")),
         Method("rapid-ppo", "RAPID, 300K + 700K PPO", "learned", lambda s: rapid(s, _paper_data(s), plan="ppo")),
+        Method(
+            "rapid-robust",
+            "RAPID, adapted under attack",
+            "learned",
+            lambda s: rapid(s, _paper_data(s), beta=0.0, plan="robust"),
+        ),
         Method("mlp-ppo", "MLP, 300K + 700K PPO", "learned", mlp_by_ppo),
         Method("online-ddqn-10k", "online DDQN, 10K", "learned", lambda s: from_scratch(s, "ddqn", "careful")),
         Method(

@@ -1,0 +1,115 @@
+"""Marked blocks of README and the documentation, filled from the committed rows.
+
+A block begins with ``<!-- table: NAME -->`` and ends with ``<!-- end -->``.
+
+``rapid reproduce --readme`` writes them, ``--check`` says whether they are what the rows say.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rapid.errors import RapidError, did_you_mean
+from rapid.evaluation.metrics import EpisodeRow, column
+from rapid.experiments.exhibits import ALL, Request, method_drives, rows_of
+from rapid.experiments.figures import Lines, Router
+from rapid.experiments.methods import METHODS
+from rapid.experiments.migrate import Legacy
+from rapid.experiments.paper import paper_result
+from rapid.experiments.store import Store
+from rapid.experiments.tables import Facts, markdown
+from rapid.files import write_text
+from rapid.scenarios import PAPER_SCENARIOS, get_scenario
+
+BLOCK = re.compile(r"(<!-- table: ([\w:-]+) -->\n).*?(<!-- end -->)", re.S)
+WORKS = ("slower", "blind", "teacher", "offline-dqn", "distilled", "rapid-ppo", "rapid-robust")
+"""Rows of README's table; the paper's own row stands above them."""
+
+
+def _number(rows: Sequence[EpisodeRow]) -> str:
+    if not rows:
+        return "–"
+    crash = f"{float(np.mean(column(rows, 'crashed'))):.2f}".removeprefix("0")
+    return f"{float(np.mean(column(rows, 'episode_return'))):.1f} ({crash})"
+
+
+def works(store: Store) -> str:
+    """Return README's table: what each driver earns, clean and under PGD, in the paper's three scenarios."""
+    lanes = [f"lane-{get_scenario(name).lanes}" for name in PAPER_SCENARIOS]
+    heads = [f"{lane}, {what}" for lane in lanes for what in ("clean", "PGD")]
+    paper = [
+        f"{said.mean:.1f}" if (said := paper_result("attack", attack, scenario=name, method="RAPID")) else "–"
+        for name in PAPER_SCENARIOS
+        for attack in ("none", "pgd")
+    ]
+    lines = [["", *heads], ["*the paper's RAPID*", *paper]]
+    for name in WORKS:
+        method = METHODS[name]
+        cells: list[str] = []
+        for scenario in PAPER_SCENARIOS:
+            for attack in ("none", "pgd"):
+                seen = attack if method.looks else "none"
+                if not method.trained and method.looks and attack == "pgd":
+                    cells.append("–")
+                    continue
+                drives = method_drives(Request("strong", "full"), method, scenario, (seen,))
+                rows, _ = rows_of(store, drives, Legacy("strong", name, scenario, seen))
+                cells.append(_number(rows))
+        label = f"**{method.label}**" if name == WORKS[-1] else method.label
+        lines.append([label, *cells])
+    first, *rest = ("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join([first, "|" + "---|" * (len(heads) + 1), *rest])
+
+
+def _exhibit(name: str, recipe: str, store: Store) -> str:
+    exhibit = ALL[name]
+    shown = exhibit.show(Request(recipe, "full"), store, exhibit)
+    tables = [each.data() if isinstance(each, Lines | Router) else each for each in shown]
+    parts = [markdown(table) for table in tables if not isinstance(table, Facts) or table.rows]
+    return "\n\n".join(parts)
+
+
+BLOCKS: dict[str, Callable[[Store], str]] = {"works": works}
+"""Blocks with a form of their own; others are EXHIBIT:RECIPE."""
+
+
+def filled(text: str, store: Store, path: Path) -> str:
+    """Return a page with its blocks filled.
+
+    Raises:
+        RapidError: a block names nothing that exists.
+    """
+
+    def fill(match: re.Match[str]) -> str:
+        name = match[2]
+        exhibit, _, recipe = name.partition(":")
+        if name in BLOCKS:
+            body = BLOCKS[name](store)
+        elif exhibit in ALL:
+            body = _exhibit(exhibit, recipe or ALL[exhibit].recipes[0], store)
+        else:
+            raise RapidError(f"'{path}' has a block '{name}'{did_you_mean(name, (*BLOCKS, *ALL))} Correct its name.")
+        return f"{match[1]}{body}\n{match[3]}"
+
+    return BLOCK.sub(fill, text)
+
+
+def pages(root: Path) -> list[Path]:
+    """Return the pages under `root` that have blocks."""
+    found = [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+    return [path for path in found if path.is_file() and BLOCK.search(path.read_text(encoding="utf-8"))]
+
+
+def update(root: Path, store: Store, check: bool) -> list[Path]:
+    """Fill the blocks of every page, or with `check` only look; return the pages that were not up to date."""
+    stale: list[Path] = []
+    for path in pages(root):
+        before = path.read_text(encoding="utf-8")
+        after = filled(before, store, path)
+        if after != before:
+            stale.append(path)
+            if not check:
+                write_text(path, after)
+    return stale
