@@ -49,7 +49,7 @@ def test_processes_do_the_same():
     ("argument", "error", "says"),
     [
         (-1, RapidError, "no such thing"),
-        (-2, RapidError, "ended from outside .exit code -9"),
+        (-2, RapidError, "ended from outside .signal 9."),
         (-4, RuntimeError, "slip"),
     ],
 )

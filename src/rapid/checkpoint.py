@@ -1,9 +1,10 @@
 """Resumable state on disk: one safetensors file, whose header holds the structure as JSON. Nothing that runs code.
 
 The file is written beside its place and renamed over the previous one, which therefore stays good until the new one is
-complete.
+complete. It carries the SHA-256 of everything in it, which is checked when it is read.
 """
 
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -16,10 +17,10 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rapid import files
-from rapid.errors import RapidError
+from rapid.errors import DamagedError, RapidError
 
 FORMAT = "rapid-state"
-VERSION = 2
+VERSION = 3
 
 State = dict[Any, Any]
 
@@ -37,7 +38,8 @@ def save_state(path: str | os.PathLike[str], state: State) -> None:
     """
     tensors: dict[str, Tensor] = {}
     tree = _pack(state, tensors, {}, "state")
-    header = {"format": FORMAT, "version": str(VERSION), "tree": json.dumps(tree)}
+    text = json.dumps(tree)
+    header = {"format": FORMAT, "version": str(VERSION), "tree": text, "sha256": _digest(text, tensors)}
     with files.atomic_path(path) as temporary:
         try:
             save_file(tensors, temporary, header)
@@ -51,7 +53,8 @@ def load_state(path: str | os.PathLike[str]) -> State:
     """Read a state that :func:`save_state` wrote; tensors come on the CPU.
 
     Raises:
-        RapidError: the file is missing, damaged or of another version.
+        DamagedError: the file is not what was written.
+        RapidError: the file is missing, or of another version.
     """
     if not Path(path).is_file():
         raise RapidError(f"There is no checkpoint at '{path}'. Check the path, or start from the beginning.")
@@ -63,19 +66,33 @@ def load_state(path: str | os.PathLike[str]) -> State:
         raise _damaged(path, error) from error
     if header.get("format") != FORMAT:
         raise RapidError(f"'{path}' is not a checkpoint of a training. Give a file that a training wrote.")
-    if header.get("version") != str(VERSION):
+    # Version 2 is the same without a checksum.
+    if header.get("version") not in ("2", str(VERSION)):
         raise RapidError(
             f"The checkpoint '{path}' has version {header.get('version')}, but this program reads version {VERSION}. "
             "Resume with the program's version that wrote it, or start from the beginning."
         )
+    if header["version"] != "2" and header.get("sha256") != _digest(header.get("tree", ""), tensors):
+        raise _damaged(path, "it does not have the SHA-256 that it names")
     try:
         return _unpack(json.loads(header["tree"]), tensors)
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, IndexError, RecursionError, AttributeError) as error:
         raise _damaged(path, error) from error
 
 
-def _damaged(path: str | os.PathLike[str], error: Exception) -> RapidError:
-    return RapidError(f"The checkpoint '{path}' is damaged: {error}. Use an earlier one, or start from the beginning.")
+def _digest(tree: str, tensors: dict[str, Tensor]) -> str:
+    """Return the SHA-256 of a structure and of its tensors."""
+    digest = hashlib.sha256(tree.encode())
+    for key in sorted(tensors):
+        tensor = tensors[key]
+        digest.update(f"{key} {tensor.dtype} {list(tensor.shape)}".encode())
+        if tensor.numel():
+            digest.update(tensor.contiguous().view(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _damaged(path: str | os.PathLike[str], why: Exception | str) -> DamagedError:
+    return DamagedError(f"The checkpoint '{path}' is damaged: {why}. Use an earlier one, or start from the beginning.")
 
 
 def _pack(value: Any, tensors: dict[str, Tensor], seen: dict[Any, str], where: str) -> Any:

@@ -3,6 +3,7 @@
 This module answers ``rapid --help`` by itself and imports a verb's machinery only when the verb is called.
 """
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -49,7 +50,7 @@ def help_text() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
+    """Run the command line and exit: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 143 told to end."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
@@ -59,37 +60,66 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if words[0] in ("--version", "version"):
         print(f"rapid {rapid.__version__}")
         raise SystemExit(0)
-    try:
-        if words[0] not in VERBS:
-            raise RapidError(f"Unknown verb '{words[0]}'{did_you_mean(words[0], VERBS)} Verbs: {', '.join(VERBS)}.")
-        # Several processes scale better than several threads; see docs/architecture.md.
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        from rapid.verbs import call
+    # Before the heavy imports, which take seconds.
+    from rapid import termination
 
-        code = call(words[0], words[1:])
+    try:
+        with termination.noticed():
+            code = _call(words)
     except RapidError as error:
         if debug:
             raise
-        print(f"rapid: {printable(str(error))}", file=sys.stderr)
+        _say(f"rapid: {error}")
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        if debug:
-            raise
-        print("\nrapid: interrupted. What is done is kept: the same command, without --from, goes on.", file=sys.stderr)
-        raise SystemExit(130) from None
+    except termination.StoppedError as stopped:
+        _say(f"rapid: told to end; {stopped}. The same command, without --from, goes on.")
+        raise SystemExit(termination.EXIT_CODE) from None
     except BrokenPipeError:
         # The reader of our output went away (`rapid ... | head`): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None
-    except OSError as error:
+    except (Exception, KeyboardInterrupt) as error:
         if debug:
             raise
-        said = printable(str(error))
-        print(
-            f"rapid: The system refused: {said}. Check the path, its permissions and the free space.", file=sys.stderr
-        )
-        raise SystemExit(2) from None
+        if termination.interrupted() or isinstance(error, KeyboardInterrupt):
+            termination.quietly()
+            _say("\nrapid: interrupted. What is done is kept: the same command, without --from, goes on.")
+            raise SystemExit(130) from None
+        if isinstance(error, OSError):
+            _say(f"rapid: The system refused: {error}. Check the path, its permissions and the free space.")
+            raise SystemExit(2) from None
+        if isinstance(error, MemoryError):
+            _say("rapid: There is not enough memory. Choose smaller sizes, or close other programs.")
+            raise SystemExit(2) from None
+        raise
     raise SystemExit(code)
+
+
+def _call(words: Sequence[str]) -> int:
+    """Do what the words say and return the exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        # Where a path is shown that is no text, or the terminal lacks a character, an escape is better than an error.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    if words[0] not in VERBS:
+        raise RapidError(f"Unknown verb '{words[0]}'{did_you_mean(words[0], VERBS)} Verbs: {', '.join(VERBS)}.")
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise RapidError(
+                f"'{word}' is not text in UTF-8, and the records that RAPID keeps are. Give the file or directory "
+                "another name, or a link to it."
+            ) from None
+    # Several processes scale better than several threads; see docs/architecture.md.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from rapid.verbs import call
+
+    return call(words[0], words[1:])
+
+
+def _say(text: str) -> None:
+    print(printable(text), file=sys.stderr)
 
 
 if __name__ == "__main__":

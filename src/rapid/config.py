@@ -429,7 +429,8 @@ class Config:
     seed: Seed = 0
     """The seed from which every random stream is derived."""
     threads: Positive = 1
-    """Torch threads of this process; scale by processes instead."""
+    """Torch threads of this process; scale by processes instead. Another number gives other weights, in their last bits
+    at first."""
     device: str = "cpu"
     """Torch device."""
     tracking: Literal["none", "tensorboard", "wandb", "trackio"] = "none"
@@ -451,10 +452,12 @@ class Config:
 
 
 def without_place(config: Config) -> Config:
-    """Return `config` with the settings at their defaults that say where and how fast it is computed, not what."""
+    """Return `config` with the settings at their defaults that say where and how fast it is computed, not what.
+
+    The number of threads is none of them: sums are then added up in another order, and weights differ in the last bits.
+    """
     return replace(
         config,
-        threads=1,
         tracking="none",
         collect=replace(config.collect, engine="local", workers=1),
         evaluate=replace(config.evaluate, workers=1),

@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Literal, TypeVar, get_args
 
 import rapid
+from rapid import termination
 from rapid.errors import RapidError, did_you_mean
 
 Engine = Literal["local", "ray"]
@@ -125,10 +126,11 @@ def _in_processes(
                 index, argument = waiting.pop()
                 ours, theirs = context.Pipe(duplex=False)
                 process = context.Process(target=_serve, args=(theirs, function, argument), daemon=True)
-                process.start()
-                # Only the process holds the other end, so that its death shows as the end of the pipe.
-                theirs.close()
-                running[ours] = index, process
+                with termination.deaf_children():
+                    process.start()
+                    # Only the process holds the other end, so that its death shows as the end of the pipe.
+                    theirs.close()
+                    running[ours] = index, process
             for connection in wait(list(running)):
                 assert isinstance(connection, Connection)
                 index, process = running[connection]
@@ -136,15 +138,15 @@ def _in_processes(
                     kind, value = connection.recv()
                 except EOFError:
                     process.join(_PATIENCE)
+                    why = _ended(process.exitcode)
                     if lost is not None:
                         del running[connection]
                         connection.close()
-                        yield index, lost(index, f"its process was ended from outside (exit code {process.exitcode})")
+                        yield index, lost(index, f"its process {why}")
                         continue
                     raise RapidError(
-                        f"The process of job {index + 1} of {waiting.total} was ended from outside (exit code "
-                        f"{process.exitcode}); too little memory is the usual cause. What is done is kept: run the "
-                        "same command again, perhaps with fewer workers."
+                        f"The process of job {index + 1} of {waiting.total} {why}. What is done is kept: run the same "
+                        "command again, perhaps with fewer workers."
                     ) from None
                 if kind == "report":
                     receive(index, value)
@@ -159,6 +161,13 @@ def _in_processes(
             connection.close()
         for _, process in running.values():
             process.join(_PATIENCE)
+
+
+def _ended(exit_code: int | None) -> str:
+    """Return how a process ended without an answer."""
+    if exit_code is not None and exit_code < 0:
+        return f"was ended from outside (signal {-exit_code}); too little memory is the usual cause"
+    return f"ended by itself (exit code {exit_code}); what it printed above says why"
 
 
 def _serve(connection: Connection, function: Callable[[Any, Report], Any], argument: Any) -> None:
@@ -185,6 +194,13 @@ def _attempt(version: str, function: Callable[[Any, Report], Any], argument: Any
         return "result", function(argument, report)
     except RapidError as error:
         return "refusal", str(error)
+    except OSError as error:
+        return "refusal", (
+            f"The system refused a worker's work: {error}. Check the free space and the permissions. What is done is "
+            "kept: run the same command again."
+        )
+    except MemoryError:
+        return "refusal", "A worker has not enough memory. What is done is kept: run it again with fewer workers."
     except Exception:
         return "fault", traceback.format_exc()
 

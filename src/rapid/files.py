@@ -185,8 +185,19 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def write_text(path: str | os.PathLike[str], content: str) -> None:
-    """Write UTF-8 text atomically."""
-    write_bytes(path, content.encode())
+    """Write UTF-8 text atomically.
+
+    Raises:
+        RapidError: it holds half a character, as a path that is not UTF-8 does.
+    """
+    try:
+        encoded = content.encode()
+    except UnicodeEncodeError as error:
+        raise RapidError(
+            f"Cannot write '{path}': {content[error.start - 20 : error.end + 20]!r} is not UTF-8. It is probably a "
+            "path: work in a directory whose name is UTF-8."
+        ) from error
+    write_bytes(path, encoded)
 
 
 def write_json(path: str | os.PathLike[str], content: Any, *, sealed: bool = False) -> None:

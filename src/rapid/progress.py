@@ -11,6 +11,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from rapid import termination
 from rapid.text import printable
 
 SECONDS_BETWEEN_LINES = 5.0
@@ -49,6 +50,7 @@ class Task:
 
     def advance(self, amount: float = 1) -> None:
         """Count `amount` more units as done."""
+        termination.check()
         self.done += amount
         if self._bar is not None and self._bar_id is not None:
             self._bar.update(self._bar_id, completed=self.done)

@@ -16,6 +16,7 @@ from typing import Any, NoReturn, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid import termination
 from rapid.errors import RapidError
 from rapid.simulator import startup
 from rapid.simulator.settings import Settings
@@ -106,8 +107,9 @@ class WorldPool:
                 self._connections.append(ours)
                 arguments = (theirs, memory, worlds, settings, mode, part)
                 worker = context.Process(target=_work, args=arguments, daemon=True, name="rapid-worlds")
-                worker.start()
-                self._workers.append(worker)
+                with termination.deaf_children():
+                    worker.start()
+                    self._workers.append(worker)
                 theirs.close()
             for place in range(len(self._workers)):
                 self._answer(place, starting=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rapid import termination
 from rapid.config import DistillConfig, LossConfig, NetworkConfig
 from rapid.data.replay import OfflineSampler
 from rapid.data.transitions import TEACHER, Transitions
@@ -25,6 +26,7 @@ from rapid.training.machinery.record import Evaluate, Record, Track, crossed, fi
 LOG_EVERY = 100
 
 
+@termination.waiting()
 @flush_denormals()
 def distill(
     transitions: Transitions,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rapid import termination
 from rapid.config import AdaptConfig, PpoConfig
 from rapid.data.replay import OfflineSampler, ReplayBuffer, join_batches
 from rapid.data.transitions import Transitions
@@ -28,6 +29,7 @@ LOG_EVERY = 1_000
 """Environment steps between two lines of metrics."""
 
 
+@termination.waiting()
 @flush_denormals()
 def adapt(
     network: QNetwork,

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rapid import termination
 from rapid.config import AdaptConfig, NetworkConfig, PpoConfig
 from rapid.config_io import least_steps
 from rapid.errors import RapidError
@@ -37,6 +38,7 @@ TERMS = ("value", "policy", "entropy", "kl")
 moved from the one that drove."""
 
 
+@termination.waiting()
 @flush_denormals()
 def adapt_by_ppo(
     network: QNetwork,

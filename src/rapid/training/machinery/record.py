@@ -1,5 +1,10 @@
-"""What a training leaves in its directory: metrics as JSON lines, and a checkpoint to resume from."""
+"""What a training leaves in its directory: metrics as JSON lines, and a checkpoint to resume from.
 
+The checkpoint is the truth: it holds the rows that were written before it, and the file of the metrics, which is there
+for people and other programs, is made to agree with it whenever the training goes on.
+"""
+
+import contextlib
 import hashlib
 import json
 import math
@@ -11,12 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from rapid import checkpoint
-from rapid.config_io import apply_overrides, to_dict
-from rapid.errors import RapidError
+from rapid import checkpoint, termination
+from rapid.config_io import apply_overrides, differences, to_dict
+from rapid.errors import DamagedError, RapidError
+from rapid.files import AppendedFile, make_directory, write_text
 from rapid.networks.q_network import QNetwork
+from rapid.progress import warn
 
 METRICS_FILE, CHECKPOINT_FILE = "metrics.jsonl", "checkpoint.safetensors"
 
@@ -47,13 +55,13 @@ class Record:
     ) -> None:
         self.directory = Path(directory)
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
+            make_directory(self.directory)
         except OSError as error:
             raise RapidError(f"Cannot train in '{directory}': {error}. Choose a directory you can write to.") from error
         self._kinds = {key: type(value) for key, value in settings.items() if is_dataclass(value)}
-        self._settings = {key: _plain(value) for key, value in settings.items()}
+        self._settings = {key: _plain(value) for key, value in settings.items()} | {"threads": torch.get_num_threads()}
         self._every, self._track = every_seconds, track
-        self._seconds_before = 0.0
+        self._seconds_before, self._text = 0.0, ""
         self._start = self._last = time.monotonic()
 
     @property
@@ -62,56 +70,82 @@ class Record:
         return self._seconds_before + time.monotonic() - self._start
 
     def resume(self) -> dict[str, Any] | None:
-        """Return the state of the last checkpoint, the metrics after it removed; None if there is none.
+        """Return the state of the last checkpoint, the metrics made to agree with it; None if there is none.
+
+        A damaged one is named and put aside, and the training begins anew: it comes to the same end.
 
         Raises:
-            RapidError: it belongs to another training, or is damaged.
+            RapidError: it belongs to another training.
         """
         path, metrics = self.directory / CHECKPOINT_FILE, self.directory / METRICS_FILE
-        if not path.exists():
+        content = self._read(path) if path.exists() else None
+        if content is None:
             metrics.unlink(missing_ok=True)
             return None
-        state = checkpoint.load_state(path)
-        before = state["settings"]
+        before = content["settings"]
         for key in self._kinds.keys() & before.keys():
             before[key] = _plain(apply_overrides(self._kinds[key](), before[key], key, f"'{path}'"))
-        differing = [key for key in self._settings if before.get(key) != self._settings[key]]
-        if differing:
+        # Before it was told, it was the default.
+        before.setdefault("threads", 1)
+        if any(before.get(key) != value for key, value in self._settings.items()):
             raise RapidError(
-                f"'{self.directory}' holds a training with other settings ({', '.join(differing)} differ). Choose "
-                "another directory, or delete this one to start anew."
+                f"'{self.directory}' holds a training with other settings: {differences(before, self._settings)}. "
+                "Nothing was changed. Choose another directory, or delete this one to start anew."
             )
-        self._seconds_before = state["seconds"]
-        if state["metrics_bytes"]:
-            if not metrics.exists() or metrics.stat().st_size < state["metrics_bytes"]:
-                raise RapidError(
-                    f"'{metrics}' was cut off or removed. Restore it, or delete the directory to start anew."
-                )
-            os.truncate(metrics, state["metrics_bytes"])
-            if self._track:
-                for row in load_metrics(self.directory):
-                    self._track(row)
-        else:
-            metrics.unlink(missing_ok=True)
-        return state["state"]
+        self._seconds_before = content["seconds"]
+        self._text = content["metrics"]
+        if not metrics.exists() or metrics.read_bytes() != self._text.encode():
+            write_text(metrics, self._text)
+        if self._track:
+            for line in self._text.splitlines():
+                self._track(json.loads(line))
+        return content["state"]
+
+    def _read(self, path: Path) -> dict[str, Any] | None:
+        """Return what a checkpoint holds; None if it is damaged."""
+        try:
+            content = checkpoint.load_state(path)
+            if "metrics" not in content:  # an earlier version left them to the other file
+                log = self.directory / METRICS_FILE
+                content["metrics"] = (log.read_bytes() if log.exists() else b"")[: content["metrics_bytes"]].decode()
+                if len(content["metrics"].encode()) < content["metrics_bytes"]:
+                    raise DamagedError(f"'{log}' was cut off or removed.")
+            return content
+        except (DamagedError, KeyError, UnicodeDecodeError) as error:
+            aside = path.with_name(f"{path.stem}.damaged{path.suffix}")
+            warn(f"{error} It is kept as '{aside.name}', and the training begins anew, with the same result.")
+            path.replace(aside)
+            return None
 
     def write(self, row: dict[str, Any]) -> None:
         """Append one line of metrics; NaN and infinity become null."""
         row = _finite(row)
-        with (self.directory / METRICS_FILE).open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(row, allow_nan=False) + "\n")
+        line = json.dumps(row, allow_nan=False) + "\n"
+        with AppendedFile(self.directory / METRICS_FILE) as log:
+            log.append(line.encode())
+        self._text += line
         if self._track:
             self._track(row)
 
     def checkpoint(self, state: Callable[[], dict[str, Any]], now: bool = False) -> None:
-        """Save what `state` returns if it is time, or `now`."""
-        if not now and time.monotonic() - self._last < self._every:
+        """Save what `state` returns if it is time, or `now`, or if the process was told to end.
+
+        Raises:
+            StoppedError: it was told to end, and the checkpoint is written.
+        """
+        ending = termination.requested()
+        if not now and not ending and time.monotonic() - self._last < self._every:
             return
+        # In this order: whoever finds the checkpoint finds all of its metrics.
         metrics = self.directory / METRICS_FILE
-        size = metrics.stat().st_size if metrics.exists() else 0
-        content = {"settings": self._settings, "seconds": self.seconds, "metrics_bytes": size, "state": state()}
+        if metrics.exists():
+            with AppendedFile(metrics) as log:
+                log.sync()
+        content = {"settings": self._settings, "seconds": self.seconds, "metrics": self._text, "state": state()}
         checkpoint.save_state(self.directory / CHECKPOINT_FILE, content)
         self._last = time.monotonic()
+        if ending and not now:
+            raise termination.StoppedError(f"a last checkpoint is in '{self.directory}'")
 
 
 def _plain(value: Any) -> Any:
@@ -152,11 +186,23 @@ def network_fingerprint(network: QNetwork) -> str:
 def load_metrics(directory: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """Return the metrics that a training left in its directory, one dictionary per line.
 
+    Where the file is missing or damaged, they are those in the checkpoint.
+
     Raises:
-        RapidError: there are none, or a line is damaged.
+        RapidError: there are neither.
     """
-    path = Path(directory) / METRICS_FILE
+    path, saved = Path(directory) / METRICS_FILE, Path(directory) / CHECKPOINT_FILE
+    fault: Exception | None = None
+    text = ""
     try:
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    except (OSError, ValueError) as error:
-        raise RapidError(f"Cannot read the metrics '{path}': {error}. Train again.") from error
+        text = path.read_text(encoding="utf-8")
+        rows = [json.loads(line) for line in text.splitlines()]
+    except (OSError, ValueError, RecursionError) as error:
+        fault, rows = error, []
+    if saved.exists() and (fault or not rows):
+        with contextlib.suppress(RapidError):
+            text = checkpoint.load_state(saved).get("metrics", text)
+            return [json.loads(line) for line in text.splitlines()]
+    if fault:
+        raise RapidError(f"Cannot read the metrics '{path}': {fault}. Train again.") from fault
+    return rows
