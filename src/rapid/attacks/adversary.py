@@ -21,13 +21,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rapid.agents.saved import load_agent, save_agent
+from rapid.agents.saved import load_agent, remembers, save_agent
 from rapid.attacks.attack import Base, Field, Moment, Needs, Shown, network_of, values_of
 from rapid.attacks.directed import reachable
 from rapid.attacks.draws import Source
 from rapid.attacks.search import Runs, Values
 from rapid.attacks.spec import AttackSpec
-from rapid.attacks.world import act_on, remembers
+from rapid.attacks.world import act_on
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, build_network

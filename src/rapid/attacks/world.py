@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rapid.agents.saved import remembers
 from rapid.attacks.attack import Base, Field, Moment, Needs, Shown, network_of, values_of
 from rapid.attacks.directed import reachable, reachable_without_gradients
 from rapid.attacks.draws import Source
@@ -121,11 +122,6 @@ class WorldAttack(Base):
         env.close()
         ordered_BT = -np.sort(-np.stack(costs, 1), 1)
         return ordered_BT[:, min(self.spec.budget, ordered_BT.shape[1]) - 1]
-
-
-def remembers(agent: Any) -> bool:
-    """Whether an agent has a memory: a state for each world, given to ``act`` beside the observations."""
-    return bool(getattr(agent, "has_memory", False))
 
 
 def act_on(
