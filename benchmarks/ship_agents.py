@@ -88,7 +88,7 @@ def main() -> None:
         write_bytes(home / file, (chosen.agent / file).read_bytes())
     shipped = load_agent(home)
     try:
-        parity = export_onnx(shipped, home / ONNX_FILE, driven_observations(shipped, scenario, seeds[:4]))
+        parity = export_onnx(shipped, home / ONNX_FILE, *driven_observations(shipped, scenario, seeds[:4]))
         onnx: Any = {"sha256": sha256(home / ONNX_FILE), "largest_difference": float(f"{parity.difference:.2g}")}
     except RapidError as error:
         onnx = str(error)
