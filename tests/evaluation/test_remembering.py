@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from rapid.agents.saved import QAgent
+from rapid.agents.saved import QAgent, remembered
 from rapid.attacks import get_attack
 from rapid.attacks.attack import values_of
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.evaluation import rollouts
+from rapid.evaluation.recording import explained_by
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.memory import STEPS, initial_state, next_state
 from rapid.networks.q_network import build_network, with_memory
@@ -100,6 +101,19 @@ def test_what_is_said_of_a_decision_is_of_the_state_it_was_made_in():
         np.testing.assert_allclose(recorded.q_TA[step], q_A, rtol=1e-5, atol=1e-6)
         assert q_A.argmax() == action
         state = agent.remember(state, np.array([action]))
+
+
+def test_a_recording_is_explained_with_what_was_remembered():
+    agent = remembering()
+    (recorded,) = run_episodes(agent, SCENARIO, [900_000], record=True).recordings
+    states = remembered(agent, recorded.action_T)
+    assert states.shape == (len(recorded.action_T) + 1, 6)
+    assert states[:, STEPS].tolist() == list(range(len(recorded.action_T) + 1))
+    told = agent.explain(recorded.obs_TVF[:-1, :15], states[:-1])
+    np.testing.assert_allclose(told.q_BA.numpy(), recorded.q_TA, rtol=1e-4, atol=1e-5)
+    explained = explained_by(agent, recorded)
+    np.testing.assert_allclose(explained.weights_TVN, told.weights_BVN.numpy(), rtol=1e-4, atol=1e-5)
+    assert remembered(QAgent(build_network(NetworkConfig(), 3, 1)), recorded.action_T) is None
 
 
 def test_who_forgets_the_state_is_told():

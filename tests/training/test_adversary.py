@@ -6,19 +6,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_distill import Killed, lines, network, weights
+from test_distill import DATA, Killed, lines, network, weights
 from test_ppo import CONFIG, PPO, TimedWorlds, worlds
 
+from rapid.agents.open import check_road
+from rapid.agents.saved import load_agent, remembers, save_agent
 from rapid.config import AdversaryConfig, Config
 from rapid.config_io import validate
 from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
-from rapid.networks.memory import initial_state, next_state
+from rapid.networks.memory import RIGHTMOST, initial_state, next_state
 from rapid.networks.q_network import set_phase, with_memory
+from rapid.phases.adapt import adapt_agent
+from rapid.presets import preset
 from rapid.seeding import numpy_stream
 from rapid.training import adapt_by_ppo
 from rapid.training.collector import Collector
 from rapid.training.machinery.adversary import AWAY, CLEAN, NOISE, TOWARDS, Adversary
+from rapid.training.machinery.diagnostics import Forgetting
 from rapid.training.machinery.worlds import Drive, Explorer
 from rapid.training.ppo import PpoLearner
 
@@ -212,6 +217,13 @@ def test_resumed_equals_uninterrupted_with_attack_and_memory(tmp_path, monkeypat
     assert weights(other) != weights(whole)
 
 
+def test_offline_data_holds_no_memory_to_compare_with():
+    forgetting = Forgetting(network(), DATA, 3)
+    assert forgetting.agreement(network()) == 1
+    assert forgetting.agreement(with_memory(network())) is None
+    assert Forgetting(with_memory(network()), DATA, 3).agreement(with_memory(network())) is None
+
+
 def test_bad_settings_are_refused():
     usual = Config()
     learning = replace(usual.adapt, ppo=replace(usual.adapt.ppo, steps=100_000))
@@ -236,3 +248,41 @@ def test_bad_settings_are_refused():
     refused("network.memory' is True, but must be false", network=replace(usual.network, memory=True))
     quiet = replace(usual.adapt, adversary=AdversaryConfig(noise_share=0.2))
     refused("Q-learning is not attacked", quiet)
+
+
+def test_the_plan_robust_adapts_an_agent_on_disk(tmp_path):
+    usual = preset("strong", "tiny", "robust")
+    small = replace(usual.adapt.ppo, steps=480, critic_steps=240, num_envs=8, batch_size=60)
+    config = replace(
+        usual,
+        adapt=replace(usual.adapt, ppo=small, evaluate_every=480),
+        evaluate=replace(usual.evaluate, curve_spawns=2),
+    )
+    validate(config)
+    assert config.adapt.adversary.gradient_share > 0.5
+    distilled = network()
+    save_agent(tmp_path / "distilled", distilled, {"scenario": SCENARIO})
+    agent = adapt_agent(config, tmp_path / "distilled", None, tmp_path / "out")
+    (row, last) = lines(tmp_path / "out" / "ppo")
+    assert "policy" not in row
+    assert "policy" in last
+    assert last["evaluation"]["return"] > 0
+    loaded = load_agent(tmp_path / "out" / "agent")
+    assert remembers(loaded)
+    assert weights(loaded.network) == weights(agent.network)
+    # On another road it begins elsewhere, and other lanes are possible.
+    wider = replace(config, adapt=replace(config.adapt, scenario="lane-4-density-2.5"))
+    elsewhere = adapt_agent(wider, tmp_path / "out" / "agent", None, tmp_path / "wider")
+    assert elsewhere.network.lanes == 4
+    assert elsewhere.start(1)[0, RIGHTMOST] == 3
+    assert elsewhere.network.memory.start_x < agent.network.memory.start_x
+    with pytest.raises(RapidError, match=r"knows a road of 4 lanes .* but lane-3-density-2 has 3"):
+        check_road(elsewhere, SCENARIO)
+    # Who has a memory goes on by PPO, and by nothing that would forget it.
+    with pytest.raises(RapidError, match=r"has a memory, and Q-learning keeps none. Set adapt.steps to 0"):
+        adapt_agent(preset("strong", "tiny", "bold"), tmp_path / "out" / "agent", None, tmp_path / "on")
+    mirrored = replace(
+        usual, adapt=replace(usual.adapt, memory=False, steps=0, mirror=True, ppo=replace(small, steps=0))
+    )
+    with pytest.raises(RapidError, match="left from right"):
+        adapt_agent(mirrored, tmp_path / "out" / "agent", None, tmp_path / "mirrored")

@@ -84,6 +84,11 @@ class OnnxAgent:
         """On roads with how many lanes left is as good as right to it; None where it tells them apart."""
         return self.metadata.get("mirrored_lanes")
 
+    @property
+    def remembered_lanes(self) -> int | None:
+        """On roads with how many lanes its memory is right; None where it has none."""
+        return int(self.metadata["lanes"]) if self.has_memory else None
+
     def start(self, worlds: int) -> np.ndarray:
         """Return the states (B, S), float32, with which episodes begin."""
         return initial_state(worlds, int(self.metadata["lanes"]))

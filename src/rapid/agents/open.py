@@ -95,16 +95,23 @@ def own_scenario(specs: Sequence[str]) -> str:
 
 
 def check_road(agent: Any, scenario: str) -> None:
-    """Check that what an agent takes for the mirror image of the road is that.
+    """Check that what an agent takes for the mirror image of the road is that, and the road its memory knows.
 
     Raises:
-        RapidError: it was made alike to left and right on a road with another number of lanes.
+        RapidError: it was made alike to left and right, or remembers, on a road with another number of lanes.
     """
     lanes, own = get_scenario(scenario).lanes, getattr(agent, "mirrored_lanes", None)
     if own is not None and own != lanes:
         raise RapidError(
             f"'{getattr(agent, 'name', 'The agent')}' averages what it sees with its mirror image on {own} lanes "
             f"(network.mirror), but {scenario} has {lanes}. Drive it on {own} lanes, or train it without."
+        )
+    known = getattr(agent, "remembered_lanes", None)
+    if known is not None and known != lanes:
+        raise RapidError(
+            f"'{getattr(agent, 'name', 'The agent')}' has a memory that knows a road of {known} lanes and where "
+            f"episodes begin there, but {scenario} has {lanes}. Drive it on {known} lanes, or let it go on learning "
+            f"with `rapid adapt AGENT --adapt.scenario {scenario} --adapt.steps 0` and steps of PPO."
         )
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -69,6 +70,16 @@ def remembers(agent: Any) -> bool:
     return bool(getattr(agent, "has_memory", False))
 
 
+def remembered(agent: Any, action_T: Sequence[int] | np.ndarray) -> np.ndarray | None:
+    """Return an agent's states (T + 1, S) before each action of an episode and after the last; None without memory."""
+    if not remembers(agent):
+        return None
+    states = [agent.start(1)]
+    for action in action_T:
+        states.append(agent.remember(states[-1], np.array([action], np.int64)))
+    return np.concatenate(states)
+
+
 class QAgent:
     """Drives greedily by a Q-network; one with a memory is a :class:`RememberingAgent`.
 
@@ -95,6 +106,11 @@ class QAgent:
     def mirrored_lanes(self) -> int | None:
         """On roads with how many lanes left is as good as right to it; None where it tells them apart."""
         return self.network.lanes if self.network.config.mirror else None
+
+    @property
+    def remembered_lanes(self) -> int | None:
+        """On roads with how many lanes its memory is right; None where it has none."""
+        return self.network.lanes if self.has_memory else None
 
     @property
     def has_memory(self) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from rapid.agents.saved import remembered
 from rapid.errors import RapidError
 from rapid.files import read_json, write_json
 from rapid.scenarios import NUM_FEATURES
@@ -117,7 +118,9 @@ def explained_by(agent: Any, recording: Recording) -> Recording:
     if not callable(explain) or not len(recording.action_T):
         return recording
     seen_TVF = recording.obs_TVF[:-1] if recording.seen_TVF is None else recording.seen_TVF
-    found: Any = explain(seen_TVF[:, : agent.vehicles])
+    state_TS = remembered(agent, recording.action_T[:-1])
+    given = () if state_TS is None else (state_TS,)
+    found: Any = explain(seen_TVF[:, : agent.vehicles], *given)
     attention, weights = found.attention_BLHV, found.weights_BVN
     return replace(
         recording,

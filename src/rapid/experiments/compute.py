@@ -12,7 +12,7 @@ import torch
 
 import rapid
 from rapid.agents.open import open_agent
-from rapid.agents.saved import load_agent, save_agent
+from rapid.agents.saved import load_agent, remembers, save_agent
 from rapid.config import Config
 from rapid.data.dataset import load_dataset, mix, save_dataset
 from rapid.data.relabel import relabel
@@ -160,19 +160,23 @@ def _scenes(cell: Scenes, place: Path, given: Mapping[str, Path]) -> None:
     for seed in spawn_seeds("test", cell.count):
         env = rapid.make_env(cell.scenario)
         obs_VF, _ = env.reset(seed=seed)
+        # What an agent with a memory is given beside the observation.
+        known: tuple[Any, ...] = (agent.start(1),) if remembers(agent) else ()
         for _ in range(SCENE):
-            obs_VF, _, terminated, truncated, _ = env.step(int(agent.act(np.asarray(obs_VF)[None])[0]))
+            action_B = agent.act(np.asarray(obs_VF)[None], *known)
+            known = tuple(agent.remember(state_BS, action_B) for state_BS in known)
+            obs_VF, _, terminated, truncated, _ = env.step(int(action_B[0]))
             if terminated or truncated:
                 break
         env.close()
-        told = agent.explain(np.asarray(obs_VF)[None])
+        told = agent.explain(np.asarray(obs_VF)[None], *known)
         weights_VN = None if told.weights_BVN is None else told.weights_BVN[0].tolist()
         scenes.append(
             {
                 "seed": seed,
                 "obs": np.asarray(obs_VF).tolist(),
                 "weights": weights_VN,
-                "q": agent.q_values(np.asarray(obs_VF)[None])[0].tolist(),
+                "q": agent.q_values(np.asarray(obs_VF)[None], *known)[0].tolist(),
             }
         )
     gate = getattr(agent.network, "gate", None)
@@ -187,17 +191,21 @@ def _decide(cell: Decide, place: Path, given: Mapping[str, Path]) -> None:
     previous: Any = None
     seeds = iter(spawn_seeds("tune", cell.decisions + 1))
     obs_VF, _ = env.reset(seed=next(seeds))
+    known: tuple[Any, ...] = (agent.start(1),) if remembers(agent) else ()
     while len(seconds) <= cell.decisions:
         start = time.perf_counter()
         if hasattr(agent, "decide"):
             decision = agent.decide(np.asarray(obs_VF)[None], [previous], np.array([len(seconds)], np.int64))[0]
             action, previous = int(decision.action), decision
         else:
-            action = int(agent.act(np.asarray(obs_VF)[None])[0])
+            action_B = agent.act(np.asarray(obs_VF)[None], *known)
+            known = tuple(agent.remember(state_BS, action_B) for state_BS in known)
+            action = int(action_B[0])
         seconds.append(time.perf_counter() - start)
         obs_VF, _, terminated, truncated, _ = env.step(action)
         if terminated or truncated:
             previous = None
+            known = (agent.start(1),) if remembers(agent) else ()
             obs_VF, _ = env.reset(seed=next(seeds))
     env.close()
     count = len(seconds) - 1

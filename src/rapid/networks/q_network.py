@@ -331,6 +331,19 @@ def with_memory(network: QNetwork) -> QNetwork:
     return other.train(network.training)
 
 
+def for_lanes(network: QNetwork, lanes: int) -> QNetwork:
+    """Return the network for a road with so many lanes, with the same weights; it reads as before but for the ranges.
+
+    A memory knows the road: which lanes there are, and where an episode begins.
+    """
+    if network.lanes == lanes:
+        return network
+    other = build_network(network.config, lanes, seed=0).to(network.scale_F.device)
+    ranges = {name: value for name, value in other.state_dict().items() if name.startswith("encoding.")}
+    other.load_state_dict(network.state_dict() | ranges)
+    return other.train(network.training)
+
+
 def check_memory(config: NetworkConfig) -> None:
     """Check that a network of these settings can have a memory.
 

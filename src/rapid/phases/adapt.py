@@ -9,7 +9,7 @@ from rapid.config import Config, without_place
 from rapid.config_io import to_dict
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
-from rapid.networks.q_network import check_memory, widened, with_memory
+from rapid.networks.q_network import check_memory, for_lanes, widened, with_memory
 from rapid.phases.data import learnable
 from rapid.phases.measure import learning_curve
 from rapid.progress import task
@@ -34,18 +34,21 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     if agent.resolve() == (out / "agent").resolve():
         raise RapidError(f"Adapting '{agent}' into '{out}' would replace the agent itself. Choose another directory.")
     offline = learnable(load_dataset(data)) if data else None
+    if settings.memory or network.memory is not None:
+        check_memory(replace(network.config, mirror=network.config.mirror or settings.mirror))
     # Of what was distilled, before it is mirrored or sees farther.
     forgetting = Forgetting(network, offline, seed)
     if settings.vehicles:
         network = widened(network, settings.vehicles)
     if settings.mirror:
         network.config = replace(network.config, mirror=True)
-    if settings.memory:
-        check_memory(network.config)
     if network.memory is not None and settings.steps:
         raise RapidError(
             f"'{agent}' has a memory, and Q-learning keeps none. Set adapt.steps to 0, to go on by PPO alone."
         )
+    lanes = get_scenario(scenario).lanes
+    if network.memory is not None and network.lanes != lanes:
+        network = for_lanes(network, lanes)
     check_road(QAgent(network, distilled.name), scenario)
     evaluate, seen = learning_curve(config, scenario, name), seeing(network.config.vehicles)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
@@ -67,7 +70,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
             )
         if settings.ppo.steps:
             if settings.memory:
-                network = with_memory(network)
+                network = for_lanes(with_memory(network), lanes)
             timed = replace(get_scenario(scenario), clock=True)
             adapt_by_ppo(
                 network,

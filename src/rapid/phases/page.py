@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from rapid.agents.saved import load_agent
+from rapid.agents.saved import load_agent, remembered
 from rapid.config import Config
 from rapid.config_io import apply_overrides, to_dict
 from rapid.data.dataset import load_dataset, summary
@@ -87,13 +87,15 @@ def _routing(config: Config, directory: Path, recordings: Sequence[Recording]) -
     recording = next((recording for recording in recordings if recording.agent == "RAPID"), None)
     if recording is None or config.network.kind != "rapid":
         return []
-    obs_VF = recording.obs_TVF[len(recording.action_T) // 2]
+    middle = len(recording.action_T) // 2
+    obs_VF = recording.obs_TVF[middle]
     snapshots = []
     for label, phase in (("before adaptation", "distill"), ("after adaptation", "adapt")):
         agent = load_agent(directory / phase / "rapid" / "agent")
         # What was distilled may see fewer: the nearest, which come first.
         seen_VF = obs_VF[: agent.vehicles]
-        weights_BVN = agent.explain(seen_VF[None]).weights_BVN
+        state_TS = remembered(agent, recording.action_T[:middle])
+        weights_BVN = agent.explain(seen_VF[None], None if state_TS is None else state_TS[-1:]).weights_BVN
         if weights_BVN is not None:
             snapshots.append(RoutingSnapshot(label, weights_BVN[0].numpy(), seen_VF))
     return snapshots

@@ -22,11 +22,14 @@ class Forgetting:
             return
         rows = numpy_stream(seed, "adapt/forgetting").permutation(count)[:FORGETTING_STATES]
         self._obs_BVF = torch.from_numpy(offline.obs_NVF[rows]).to(next(distilled.parameters()).device)
+        if distilled.memory is not None:
+            self._obs_BVF = None
+            return
         self._action_B = self._greedy(distilled)
 
     def agreement(self, network: QNetwork) -> float | None:
-        """Return the share; None without offline data."""
-        if self._obs_BVF is None:
+        """Return the share; None without offline data, or for a network with a memory, of which such data has none."""
+        if self._obs_BVF is None or network.memory is not None:
             return None
         return float((self._greedy(network) == self._action_B).double().mean())
 
