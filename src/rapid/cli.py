@@ -25,6 +25,7 @@ VERBS: dict[str, str] = {
     "export": "write an agent as ONNX, check it against the original, time it",
     "report": "write the page of a run again",
     "reproduce": "every table and figure of the paper, obtained beside printed",
+    "play": "open a live page: watch agents drive side by side, attack them, drive yourself",
     "presets": "print what a recipe, a scale and a plan set, or where two differ",
     "agents": "list the trained agents that come with the package",
     "models": "list, fetch, verify and remove the embedded language models",

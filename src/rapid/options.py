@@ -8,7 +8,7 @@ from typing import Annotated, Literal, TypeVar
 
 from tyro.conf import Positional, arg
 
-from rapid.bounds import Count, Positive, Seed
+from rapid.bounds import Bounds, Count, Positive, Seed
 from rapid.config import (
     AdaptConfig,
     CollectConfig,
@@ -278,6 +278,33 @@ class Reproduce:
     """Only fill the marked blocks of README.md and docs/ in this checkout from the committed rows."""
     check: bool = False
     """Only say whether those blocks are what the committed rows say."""
+
+
+@dataclass(frozen=True)
+class Play:
+    """Open a live page: agents, teachers, planners and you drive side by side on the same spawn, attacked or not.
+
+    The page is for this machine only, behind a secret in its address; Ctrl-C ends it.
+    """
+
+    agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")] = ()
+    """Directories of agents, ONNX files or drivers by name; the first two are on the road when the page opens. Saved
+    agents below ./runs, the scripted drivers, the planners, the teacher and `you` can be chosen there."""
+    scenario: str = ""
+    """Where they drive; by default where the first agent was trained."""
+    spawn: Seed = 900_000
+    """The spawn seed, which fixes the traffic; test spawns begin at 900000."""
+    moment: str = ""
+    """What a link of the page has behind its #: the same moment again, with the same drivers."""
+    port: Annotated[int, Bounds(0, 65535)] = 0
+    """Where the page is served; 0 takes a free port."""
+    browser: bool = True
+    """Whether a browser is asked to open the page; --no-browser prints its address only."""
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    """Who `teacher` is."""
+    seed: Seed = Config.seed
+    """Decides the noise of attacks and the drivers that draw."""
+    source: Flat[Source] = field(default_factory=Source)
 
 
 @dataclass(frozen=True)

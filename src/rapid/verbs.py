@@ -25,6 +25,7 @@ from rapid.options import (
     Export,
     Mix,
     Models,
+    Play,
     Presets,
     Relabel,
     Report,
@@ -272,6 +273,16 @@ def _reproduce(options: Reproduce, config: Config) -> int:
     return int(bool(failed))
 
 
+def _play(options: Play, config: Config) -> int:
+    from rapid.play import Roster, first_moment, serve
+
+    scenario = get_scenario(options.scenario).name if options.scenario else ""
+    roster = Roster(options.agents, Path("runs"), config.teacher, config.seed)
+    start = first_moment(roster, options.agents, scenario, options.spawn, options.moment)
+    serve(roster, start, options.port, config.seed, options.browser)
+    return 0
+
+
 def _presets(options: Presets, config: Config) -> int:
     if not options.first:
         for recipe, plans in OF_RECIPE.items():
@@ -355,6 +366,7 @@ VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
     "export": (Export, _export),
     "report": (Report, _report),
     "reproduce": (Reproduce, _reproduce),
+    "play": (Play, _play),
     "presets": (Presets, _presets),
     "agents": (Agents, _agents),
     "models": (Models, _models),

@@ -28,7 +28,7 @@ function makePlayer(root, options) {
     at, crash, rate, mode, ghostBox,
   );
   root.append(stage, scrub, controls, legend, aloud);
-  let time = 0, running = false, clock = null, request = 0, waiting = false, dragged = false;
+  let time = 0, running = false, clock = null, request = 0, waiting = false, dragged = false, wanted = null;
 
   const episodes = () => panes.filter((pane) => pane.episode).map((pane) => pane.episode);
   const end = () => Math.max(0, ...episodes().map(lengthOf));
@@ -68,8 +68,9 @@ function makePlayer(root, options) {
   function step(by) {
     setRunning(false);
     const to = by < 0 ? Math.ceil(time - 1e-9) - 1 : Math.floor(time + 1e-9) + 1;
+    wanted = to > end() && goesOn() ? to : null;
     seek(to);
-    if (to > time) for (const pane of panes) if (pane.episode?.ended === false) options.more(pane.index);
+    if (wanted !== null) for (const pane of panes) if (pane.episode?.ended === false) options.more(pane.index);
     say(aloud, panes.filter((pane) => pane.episode).map(({ episode }) => `${episode.agent}: ${describe(episode, Math.min(time, lengthOf(episode)), names)}`).join(" "));
   }
   const crashes = () => episodes().map(crashTime).filter((t) => t !== null).sort((a, b) => a - b);
@@ -161,6 +162,8 @@ function makePlayer(root, options) {
     grow(index) {
       panes[index].view.grow();
       explain();
+      // A step on that had to be driven first.
+      if (wanted !== null && end() >= wanted) [time, wanted] = [wanted, null];
       render();
     },
   };
