@@ -107,7 +107,7 @@ def test_a_tab_that_goes_in_the_middle_of_an_episode_leaves_its_place(live: Live
         tab.send(
             json.dumps({"type": "open", "pane": 0, "ride": 1, "scenario": SCENARIO, "spawn": 1, "agent": "slower"})
         )
-        tab.socket.close()  # without a word
+        tab.socket.shutdown(socket.SHUT_RDWR)  # without a word
     with talk(live) as tab:
         tab.send(
             json.dumps({"type": "open", "pane": 0, "ride": 1, "scenario": SCENARIO, "spawn": 1, "agent": "slower"})

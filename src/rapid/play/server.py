@@ -62,21 +62,22 @@ class LivePage:
         self.token = secrets.token_urlsafe(24)
         self._lock, self._tabs = threading.Lock(), threading.BoundedSemaphore(MOST_TABS)
         try:
-            listening = socket.create_server((HOST, self.port))
+            self._listening = socket.create_server((HOST, self.port))
         except (OSError, OverflowError) as error:
             taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
             why = "is in use by another program" if taken else f"cannot be had: {error}"
             raise RapidError(
                 f"Port {self.port} {why}. Choose another with --port, or leave it out for a free one."
             ) from error
-        self.port = int(listening.getsockname()[1])
+        self._serving = False
+        self.port = int(self._listening.getsockname()[1])
         self._hosts = (f"{HOST}:{self.port}", f"localhost:{self.port}")
         # What a browser does wrong is answered; it is no news for a terminal.
         quiet = logging.getLogger("rapid.play")
         quiet.setLevel(logging.CRITICAL)
         self._server: Server = serve_sockets(
             self._talk,
-            sock=listening,
+            sock=self._listening,
             origins=[f"http://{host}" for host in self._hosts],  # type: ignore[arg-type]
             process_request=self._page_or_socket,
             compression=None,
@@ -93,11 +94,15 @@ class LivePage:
 
     def serve_forever(self) -> None:
         """Answer until :meth:`close` is called."""
+        self._serving = True
         self._server.serve_forever()
 
     def close(self) -> None:
         """Stop answering and close what is open."""
-        self._server.shutdown()
+        if self._serving:
+            self._server.shutdown()
+        else:
+            self._listening.close()  # shutdown would wait for a loop that never began
 
     def _talk(self, connection: ServerConnection) -> None:
         if not self._tabs.acquire(blocking=False):
