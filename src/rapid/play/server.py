@@ -187,8 +187,8 @@ def first_moment(
 
     Args:
         roster: who can be chosen.
-        agents: who drives above and below, as far as they are named; without any, the newest agent of one's own, or a shipped
-            one, and a rule.
+        agents: who drives above and below, as far as they are named; without any, an agent of one's own or a
+            shipped one, and a rule.
         scenario: where; empty for where the first of them was trained.
         spawn: the spawn seed.
         moment: what a link to a moment has behind its ``#``, which goes before all else.
