@@ -1,8 +1,13 @@
 """Shared by all tests: one thread, and observations as a road gives them."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
+
+import browser
 
 torch.set_num_threads(1)
 
@@ -24,3 +29,10 @@ class Roads:
 def roads() -> Roads:
     """Give the maker of observations."""
     return Roads()
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """Give the system's Chromium; skips where there is none, and fails in CI."""
+    with browser.launched() as started:
+        yield started

@@ -3,11 +3,9 @@
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-import browser
 from rapid.agents.saved import save_agent
 from rapid.config import NetworkConfig
 from rapid.networks.q_network import build_network
@@ -15,13 +13,6 @@ from rapid.play.roster import Roster
 from rapid.play.server import LivePage
 
 SCENARIO = "lane-3-density-2"
-
-
-@pytest.fixture(scope="session")
-def chromium() -> Iterator[Any]:
-    """The system's Chromium; skips where there is none, and fails in CI."""
-    with browser.launched() as started:
-        yield started
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from websockets.sync.client import connect
 
-from conftest import SCENARIO
+SCENARIO = "lane-3-density-2"
 
 
 def test_ctrl_c_ends_it_while_a_tab_is_in_the_middle_of_an_episode(tmp_path: Path) -> None:

@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import SCENARIO
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.play.ride import KINDS, Ride, attack_spec
 from rapid.play.roster import Roster, You
 from rapid.scenarios import FASTER, IDLE, SLOWER
+
+SCENARIO = "lane-3-density-2"
 
 
 def driven(ride: Ride, attack: str = "none") -> list[dict]:

@@ -11,12 +11,13 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from conftest import SCENARIO
 from rapid.cli import main
 from rapid.errors import RapidError
 from rapid.play.roster import TEACHER, YOU, Roster
 from rapid.play.server import MOST_BYTES, MOST_TABS, LivePage, first_moment, serve
 from rapid.play.session import Session
+
+SCENARIO = "lane-3-density-2"
 
 
 def get(live: LivePage, path: str, host: str | None = None) -> http.client.HTTPResponse:
