@@ -236,9 +236,9 @@ def test_what_is_shown_first(roster: Roster, saved: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["rulee"], "Did you mean"),
+        (["rulee"], "did you mean 'rule'"),
         (["--scenario", "lane-3"], "Unknown scenario"),
-        (["--port", "70000"], "--port"),
+        (["--port", "70000"], "between 0 and 65535"),
         (["--moment", "x"], "no moment"),
     ],
 )
