@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from test_metrics import ROW
 
-from rapid.evaluation.summary import label_of, summarize, summary_text
+from rapid.evaluation.summary import NOT_APPLICABLE, label_of, summarize, summary_text
 
 
 def rows_of(agent: str, attack: str = "none", count: int = 6, **changes):
@@ -66,3 +66,11 @@ def test_units_are_honest_about_trainings() -> None:
     assert "one training each" in summary_text(one, resamples=50)
     three = [replace(row, training_seed=seed) for row in rows_of("rapid") for seed in range(3)]
     assert "Fewer than 5 trainings: preliminary." in summary_text(three, resamples=50)
+
+
+def test_who_has_no_values_is_not_attacked_by_search_and_that_is_said() -> None:
+    floor, net = rows_of("slower", kind="floor"), rows_of("net", has_network=True)
+    searched = [replace(row, attack=attack) for row in net for attack in ("square", "world:budget=1")]
+    by_agent = {row.agent: row for row in summarize([*floor, *net, *searched])}
+    assert {cell.missing for cell in by_agent["slower"].attacks.values()} == {NOT_APPLICABLE}
+    assert {cell.missing for cell in by_agent["net"].attacks.values()} == {""}

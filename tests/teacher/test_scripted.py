@@ -76,6 +76,9 @@ def test_immune_asks_only_whether_a_car_is_there(world, crowd):
     immune = scripted("immune")
     assert actions(immune.decide(world(), [None])) == [3]
     assert actions(immune.decide(world(cars=((190, 2, 30),)), [None])) == [4]
+    far_BVF = world(cars=((190, 2, 30),))
+    far_BVF[:, 1, 1] += 20  # said to be beyond sight, and there all the same
+    assert actions(immune.decide(far_BVF, [None])) == [4]
     lied_BVF = crowd + np.random.default_rng(0).uniform(-0.1, 0.1, crowd.shape) * [1, 200, 12, 80, 80]
     assert actions(immune.decide(lied_BVF, [None] * len(crowd))) == actions(immune.decide(crowd, [None] * len(crowd)))
 

@@ -17,8 +17,13 @@ KINDS: dict[Kind, str] = {
 """Kinds of agents in the order of the table. All but `learned` are there for reference."""
 
 NOT_APPLICABLE = "n/a"
-NOT_APPLICABLE_WHY = "a gradient attack needs a network; and who reads the world sees no observation."
+NOT_APPLICABLE_WHY = (
+    "a gradient attack needs a network, one that searches the values of the actions; and who reads the world sees no "
+    "observation."
+)
 NOT_RUN = "–"
+NEED_VALUES = ("square", "world")
+"""Kinds of attacks that ask for the values of the actions, which scripted drivers and language models have not."""
 
 _SHOWN = {
     "slower": "always-slower",
@@ -139,6 +144,7 @@ def _cell(by_attack: dict[str, list[EpisodeRow]], name: str, needs_gradient: boo
         return AttackCell(_estimate(rows, "episode_return", resamples), _estimate(rows, "crashed", resamples))
     others = [row for of in by_attack.values() for row in of]
     without = needs_gradient and not any(row.has_network for row in others)
+    without |= name.partition(":")[0] in NEED_VALUES and any(row.kind in ("floor", "teacher") for row in others)
     # All other planners read the worlds, so there is no observation of theirs to attack.
     blind = any(row.kind == "planner" and row.agent != "planner-observation" for row in others)
     return AttackCell(None, None, NOT_APPLICABLE if without or blind else NOT_RUN)

@@ -63,6 +63,8 @@ class Scripted:
         scenes = read_scenes(obs_BVF, self._lanes)
         if self.plan is not None:
             chosen = [_follow(self.plan, before) for before in previous]
+        elif self.name == "immune":
+            chosen = [_wait(bool((presence_V >= 0.5).any())) for presence_V in np.asarray(obs_BVF)[:, 1:, 0]]
         else:
             chosen = [self._choose(scene, keys_B, world) for world, scene in enumerate(scenes)]
         seconds = (time.perf_counter() - start) / max(len(chosen), 1)
@@ -76,8 +78,6 @@ class Scripted:
     ) -> tuple[int, str, tuple[float, ...] | None]:
         if self.name in _CONSTANTS:
             return _CONSTANTS[self.name], "", None
-        if self.name == "immune":
-            return (SLOWER, "another car is there", None) if scene.cars else (FASTER, "no car is there", None)
         if self.name in _RULES:
             action, explanation = _RULES[self.name](gather(scene))
             return action, explanation, None
@@ -186,6 +186,11 @@ def plan_for(scenario: str) -> Plan:
         )
     slower, right, faster = plans[scenario]["plan"]
     return slower, right, faster
+
+
+def _wait(present: bool) -> tuple[int, str, None]:
+    """Brake while any car is present, wherever it is said to be: a scene leaves out what is said to be far away."""
+    return (SLOWER, "another car is there", None) if present else (FASTER, "no car is there", None)
 
 
 def _follow(plan: Plan, previous: Decision | None) -> tuple[int, str, None]:
