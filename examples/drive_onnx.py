@@ -9,6 +9,8 @@ import onnxruntime
 import rapid
 from rapid.scenarios import seeing
 
+if len(sys.argv) not in (2, 3):
+    raise SystemExit(__doc__)
 session = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
 lanes = json.loads(session.get_modelmeta().custom_metadata_map["rapid"])["lanes"]
 scenario = {3: "lane-3-density-2", 4: "lane-4-density-2.5", 5: "lane-5-density-3"}[lanes]

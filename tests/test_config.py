@@ -1,6 +1,7 @@
 import dataclasses
 import functools
 import re
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from rapid.bounds import Bounds, numbers
 from rapid.config import Config
 from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate
 from rapid.errors import RapidError
-from rapid.parsing import base_settings
-from rapid.presets import preset
+from rapid.options import Run
+from rapid.parsing import base_settings, parse
+from rapid.presets import as_options, preset
 
 PRESETS = [(recipe, scale) for recipe in settings.RECIPES for scale in settings.SCALES]
 
@@ -103,6 +105,41 @@ def test_a_file_that_contradicts_an_option_is_told(tmp_path: Path):
         base_settings(["--config", str(file), "--scale", "tiny"])
     file.write_text("[mix]\nsize = 50\n")
     assert base_settings(["--config", str(file), "--scale", "tiny"]).mix.size == 50
+
+
+def test_a_file_that_names_a_part_leaves_the_rest_to_the_options(tmp_path: Path):
+    file = tmp_path / "some.toml"
+    file.write_text('scale = "tiny"\nseed = 7\n')
+    # What is written down as the recipe is the recipe that ran.
+    found = base_settings(["--config", str(file), "--recipe", "paper"])
+    assert found == dataclasses.replace(preset("paper", "tiny"), seed=7)
+    file.write_text('recipe = "strong"\n')
+    assert base_settings(["--config", str(file), "--scale", "full"]) == preset("strong", "full")
+    assert base_settings(["--config", str(file), "--plan", "ppo"]) == preset("strong", "quick", "ppo")
+
+
+@pytest.mark.parametrize(
+    ("names", "overrides"),
+    [
+        (("strong", "quick", "bold"), {}),
+        (("paper", "tiny", "printed"), {"seed": 3, "scenario": "lane-4-density-2.5"}),
+        (
+            ("strong", "full", "ppo"),
+            {
+                "data": "my data/of 'today'",
+                "tracking": "wandb",
+                "teacher": {"model": "--odd", "memory": "a file", "price_in": 0.1 + 0.2},
+                "network": {"hidden": [64, 32], "mask_absent": False},
+                "adapt": {"mirror": True, "freeze_decoder": True, "loss": {"robust": {"radius": 1e-9}}},
+                "evaluate": {"attacks": ["none"], "spawns": 3},
+            },
+        ),
+    ],
+)
+def test_the_command_that_repeats_a_run_gives_its_settings(names: tuple[str, ...], overrides: dict[str, Any]):
+    config = apply_overrides(preset(*names), overrides)
+    words = shlex.split(shlex.join(as_options(config)))
+    assert parse("run", {"run": Run}, words)[1] == config
 
 
 def test_every_field_has_a_docstring():
@@ -220,7 +257,7 @@ def test_every_number_has_bounds_and_the_defaults_lie_within():
 
     assert len(list(numbers(Config()))) > 70
     assert bare(Config()) == []
-    for kind, _ in VERBS.values():
+    for kind, _, _ in VERBS.values():
         given = [item.name for item in dataclasses.fields(kind) if item.default is dataclasses.MISSING]
         required = [
             name

@@ -69,3 +69,16 @@ def test_counts_stand_in_full(monkeypatch: pytest.MonkeyPatch, done: float, tota
         now[0] = 6
         work.advance(done)
     assert text in stream.getvalue()
+
+
+def test_more_than_was_asked_for_is_no_negative_time(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    stream = io.StringIO()
+    with progress.task("collect", 20, "steps", stream) as work:
+        for _ in range(3):
+            now[0] += 6
+            work.advance(7)
+    lines = stream.getvalue().splitlines()
+    assert lines[1] == "collect: 14/20 steps  ETA 5.1 s"
+    assert lines[2] == "collect: 21/21 steps  ETA 0.0 s"

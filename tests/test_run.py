@@ -1,8 +1,10 @@
 """The whole job, as small as it gets: what a user sees of it, killed and resumed, and redone from a step."""
 
+import html
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -24,6 +26,8 @@ from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.q_network import build_network
+from rapid.options import Run
+from rapid.parsing import parse
 from rapid.phases.adapt import adapt_agent
 from rapid.phases.distill import distill_agent, distill_seeds
 from rapid.phases.measure import compare
@@ -117,6 +121,15 @@ def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(fin
     assert frozen
     assert all(before[name].equal(after[name]) for name in frozen)
     assert any(not before[name].equal(after[name]) for name in before)
+
+
+def test_the_page_says_how_to_repeat_the_run_and_that_repeats_it(config: Config, finished: Path):
+    (said,) = re.findall(r'class="command">Repeat it with <code>(.*?)</code>', (finished / "report.html").read_text())
+    command, verb, *words = shlex.split(html.unescape(said))
+    options, again = parse(verb, {verb: Run}, words)
+    assert (command, verb, again) == ("rapid", "run", config)
+    # Where the run itself lives everything is done, and nothing would be repeated.
+    assert not Path(options.directory).exists()
 
 
 def test_the_same_command_again_does_nothing(config: Config, finished: Path):

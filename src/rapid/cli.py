@@ -6,11 +6,16 @@ This module answers ``rapid --help`` by itself and imports a verb's machinery on
 import io
 import os
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 
 import rapid
 from rapid.errors import RapidError, did_you_mean
 from rapid.text import printable
+
+SILENCE_S = 1.0
+"""Seconds of loading after which a line says so."""
 
 VERBS: dict[str, str] = {
     "run": "do everything: collect, mix, distill, adapt, evaluate, report",
@@ -43,11 +48,24 @@ def help_text() -> str:
         "Turn slow, clever LLM drivers into fast, robust driving policies.\n\n"
         f"verbs, in the order of the data's way:\n{verbs}\n\n"
         "options of every verb:\n"
-        "  --help     the verb's own options\n"
+        "  --help     the verb's own options; of a verb with many, those that matter most\n"
+        "  --help-all all of them\n"
         "  --debug    show the traceback of an error\n"
         "  --version  print the version\n\n"
         "Begin with: rapid run            (no key, no GPU; about ten minutes on two cores)"
     )
+
+
+@contextmanager
+def _told_if_slow(text: str) -> Generator[None, None, None]:
+    """Print `text` to standard error once the block takes longer than :data:`SILENCE_S`."""
+    notice = threading.Timer(SILENCE_S, print, (text,), {"file": sys.stderr, "flush": True})
+    notice.daemon = True
+    notice.start()
+    try:
+        yield
+    finally:
+        notice.cancel()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -114,9 +132,11 @@ def _call(words: Sequence[str]) -> int:
             ) from None
     # Several processes scale better than several threads; see docs/architecture.md.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from rapid.verbs import call
+    with _told_if_slow(f"rapid: loading what `rapid {words[0]}` needs …"):
+        from rapid.verbs import prepare
 
-    return call(words[0], words[1:])
+        do = prepare(words[0], words[1:])
+    return do()
 
 
 def _say(text: str) -> None:

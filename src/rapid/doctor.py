@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from rapid.config import TeacherConfig
-from rapid.errors import RapidError
+from rapid.errors import RapidError, how_to_install
 from rapid.files import atomic_path, cache_dir
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -138,7 +138,7 @@ def _extras() -> Finding:
     state = {extra: importlib.util.find_spec(module) is not None for extra, module in extras.items()}
     missing = [extra for extra, present in state.items() if not present]
     fact = f"present: {', '.join(extra for extra in extras if state[extra]) or 'none'}"
-    fix = f"Only if you want them: pip install 'rapid-driving[{','.join(missing)}]'" if missing else ""
+    fix = f"Only if you want them: {how_to_install(*missing)}" if missing else ""
     return Finding("extras", "ok", fact, fix)
 
 

@@ -17,7 +17,7 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 
 import rapid
 from rapid import termination
-from rapid.errors import RapidError, did_you_mean
+from rapid.errors import RapidError, did_you_mean, how_to_install
 
 Engine = Literal["local", "ray"]
 """`local`: this machine. `ray`: the cluster that the environment variable RAY_ADDRESS names or that runs here, else a
@@ -221,7 +221,7 @@ def _need_ray() -> Any:
     except ImportError as error:
         raise RapidError(
             "The engine 'ray' needs the package 'ray', which is not installed. Install it on every machine with: "
-            "pip install 'rapid-driving[ray]'; or use --engine local."
+            f"{how_to_install('ray')}; or use --engine local."
         ) from error
     return ray
 

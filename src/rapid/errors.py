@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
 
 
 class RapidError(Exception):
@@ -20,6 +21,13 @@ def sentence(text: str) -> str:
     """Return foreign words as a sentence, with one full stop at its end."""
     text = text.strip()
     return text if text.endswith((".", "!", "?", "…")) else f"{text}."
+
+
+def how_to_install(*extras: str) -> str:
+    """Return the command that installs extras of this project: from a checkout, as there is no package on the index."""
+    checkout = Path(__file__).resolve().parents[2]
+    where = f"in {checkout}" if (checkout / "pyproject.toml").is_file() else "in a checkout of RAPID"
+    return f"pip install -c constraints.txt -e '.[{','.join(extras)}]' ({where})"
 
 
 class DamagedError(RapidError):

@@ -1,7 +1,7 @@
 """From the words of the command line to a verb's options and the settings of its work."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import tyro
@@ -12,23 +12,30 @@ from rapid.config_io import apply_overrides, load_toml, validate
 from rapid.errors import RapidError
 from rapid.options import Evaluate, Play, Run, Source
 from rapid.presets import of_file, preset, without_presets
+from rapid.usage import check_options, short_help
 
 T = TypeVar("T")
 
 
-def parse(verb: str, kind: type[T], words: Sequence[str]) -> tuple[T, Config]:
-    """Return a verb's options, an instance of `kind`, and the settings that they and a settings file give.
+def parse(verb: str, kinds: Mapping[str, type[Any]], words: Sequence[str]) -> tuple[Any, Config]:
+    """Return a verb's options and the settings that they and a settings file give; `kinds` are all verbs' options.
 
     Raises:
-        RapidError: any value that cannot be used.
-        SystemExit: after printing the help, or tyro's own explanation of a wrong option (2).
+        RapidError: an option that the verb does not have, or any value that cannot be used.
+        SystemExit: after printing the help, or tyro's own explanation of a wrong value (2).
     """
+    kind, words = kinds[verb], list(words)
+    check_options(verb, words, kinds)
     base = base_settings(words)
+    defaults = _defaults(kind, base)
+    if {"-h", "--help"} & set(words) and (text := short_help(verb, kind, defaults)):
+        print(text)
+        raise SystemExit(0)
     options = tyro.cli(
         kind,
-        args=list(words),
+        args=["--help" if word == "--help-all" else word for word in words],
         prog=f"rapid {verb}",
-        default=_defaults(kind, base),
+        default=defaults,
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     check_bounds(options)
@@ -45,7 +52,7 @@ def base_settings(words: Sequence[str]) -> Config:
     overrides = load_toml(file) if file else {}
     choices = {"recipe": RECIPES, "scale": SCALES, "plan": PLANS}
     asked = {name: value for name in choices if (value := _option(words, name))}
-    if words and ("-h" in words or "--help" in words):
+    if {"-h", "--help", "--help-all"} & set(words):
         asked = {name: value for name, value in asked.items() if value in choices[name]}
     for name, value in asked.items():
         if name in overrides and overrides[name] != value:
@@ -53,8 +60,9 @@ def base_settings(words: Sequence[str]) -> Config:
                 f"The settings file '{file}' is of the {name} '{overrides[name]}', and --{name} says '{value}'. Its "
                 f"other settings would stay, so what ran would be neither. Leave --{name} out, or the file."
             )
-    named = any(name in overrides for name in choices)
-    base = of_file(overrides) if named else preset(**asked)
+    # A file that names only some of the three leaves the others to the options; a run's own names them all.
+    named = {name: str(overrides[name]) for name in choices if name in overrides} | asked
+    base = of_file(overrides | asked) if {"recipe", "scale"} <= overrides.keys() else preset(**named)
     return apply_overrides(base, without_presets(overrides), source=f"'{file}'")
 
 

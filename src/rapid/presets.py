@@ -37,6 +37,26 @@ def differences(old: Config, new: Config) -> dict[str, tuple[Any, Any]]:
     return {name: (before[name], value) for name, value in after.items() if before[name] != value}
 
 
+def as_options(config: Config) -> list[str]:
+    """Return the words after ``rapid run`` that give these settings, whatever files there are."""
+    words = ["--recipe", config.recipe, "--scale", config.scale, "--plan", config.plan]
+    words += ["--scenario", config.scenario, "--seed", str(config.seed)]
+    changed = differences(preset(config.recipe, config.scale, config.plan), config)
+    for name, (_, value) in changed.items():
+        option = name.replace("_", "-")
+        if name in ("scenario", "seed"):
+            continue
+        if isinstance(value, bool):
+            section, dot, last = option.rpartition(".")
+            words.append(f"--{section}{dot}{'' if value else 'no-'}{last}")
+        elif isinstance(value, tuple):
+            words += [f"--{option}", *map(str, typing.cast(tuple[Any, ...], value))]
+        else:
+            # What looks like an option itself must hang on to its own.
+            words += [f"--{option}={value}"] if str(value).startswith("-") else [f"--{option}", str(value)]
+    return words
+
+
 class Sizes(NamedTuple):
     """How much a scale runs, whatever the recipe and the plan; None leaves what the recipe has."""
 

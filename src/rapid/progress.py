@@ -49,11 +49,12 @@ class Task:
             self._bar.reset(self._bar_id, completed=int(self.done))
 
     def advance(self, amount: float = 1) -> None:
-        """Count `amount` more units as done."""
+        """Count `amount` more units as done. Whole episodes may be a few more than were asked for."""
         termination.check()
         self.done += amount
+        self.total = max(self.total, self.done)
         if self._bar is not None and self._bar_id is not None:
-            self._bar.update(self._bar_id, completed=self.done)
+            self._bar.update(self._bar_id, completed=self.done, total=self.total)
         elif time.monotonic() - self._last_line >= SECONDS_BETWEEN_LINES:
             self._print_line()
 

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
 from rapid import files
-from rapid.errors import RapidError
+from rapid.errors import RapidError, how_to_install
 
 Tracking = Literal["none", "tensorboard", "wandb", "trackio"]
 PROJECT = "rapid"
@@ -45,7 +45,7 @@ def check_tracking(kind: Tracking) -> None:
     if kind != "none" and importlib.util.find_spec(kind) is None:
         raise RapidError(
             f"Tracking with '{kind}' needs the package '{kind}', which is not installed. Install it with: pip install "
-            f"{kind}, or all trackers with: pip install 'rapid-driving[tracking]'; or use --tracking none."
+            f"{kind}, or all trackers: {how_to_install('tracking')}; or use --tracking none."
         )
 
 

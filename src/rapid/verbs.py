@@ -5,9 +5,11 @@ An action gets the verb's options and the settings that they give, and returns t
 
 import dataclasses
 import hashlib
+import importlib
 import json
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -42,18 +44,20 @@ if TYPE_CHECKING:
     from rapid.data.dataset import Dataset
 
 
-def call(verb: str, words: Sequence[str]) -> int:
-    """Parse the options of `verb` and do it.
+def prepare(verb: str, words: Sequence[str]) -> Callable[[], int]:
+    """Parse the options of `verb` and import what it needs.
 
     Returns:
-        The exit code.
+        What does it, and returns the exit code.
 
     Raises:
         RapidError: any input that cannot be used.
-        SystemExit: after printing the help, or tyro's own explanation of a wrong option (2).
+        SystemExit: after printing the help, or tyro's own explanation of a wrong value (2).
     """
-    kind, action = VERBS[verb]
-    return action(*parse(verb, kind, words))
+    options, config = parse(verb, {name: kind for name, (kind, _, _) in VERBS.items()}, words)
+    _, action, module = VERBS[verb]
+    importlib.import_module(module)
+    return partial(action, options, config)
 
 
 def _run(options: Run, config: Config) -> int:
@@ -353,23 +357,24 @@ def _doctor(options: Doctor, config: Config) -> int:
     return int(failed)
 
 
-VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int]]] = {
-    "run": (Run, _run),
-    "collect": (Collect, _collect),
-    "relabel": (Relabel, _relabel),
-    "mix": (Mix, _mix),
-    "distill": (Distill, _distill),
-    "adapt": (Adapt, _adapt),
-    "evaluate": (Evaluate, _evaluate),
-    "adversary": (Adversary, _adversary),
-    "teach-bench": (TeachBench, _teach_bench),
-    "export": (Export, _export),
-    "report": (Report, _report),
-    "reproduce": (Reproduce, _reproduce),
-    "play": (Play, _play),
-    "presets": (Presets, _presets),
-    "agents": (Agents, _agents),
-    "models": (Models, _models),
-    "verify-simulator": (VerifySimulator, _verify),
-    "doctor": (Doctor, _doctor),
+VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int], str]] = {
+    "run": (Run, _run, "rapid.run"),
+    "collect": (Collect, _collect, "rapid.phases.data"),
+    "relabel": (Relabel, _relabel, "rapid.data.relabel"),
+    "mix": (Mix, _mix, "rapid.phases.data"),
+    "distill": (Distill, _distill, "rapid.phases.distill"),
+    "adapt": (Adapt, _adapt, "rapid.phases.adapt"),
+    "evaluate": (Evaluate, _evaluate, "rapid.phases.measure"),
+    "adversary": (Adversary, _adversary, "rapid.phases.adversary"),
+    "teach-bench": (TeachBench, _teach_bench, "rapid.teach_bench"),
+    "export": (Export, _export, "rapid.agents.onnx"),
+    "report": (Report, _report, "rapid.phases.page"),
+    "reproduce": (Reproduce, _reproduce, "rapid.experiments.reproduce"),
+    "play": (Play, _play, "rapid.play"),
+    "presets": (Presets, _presets, "rapid.presets"),
+    "agents": (Agents, _agents, "rapid.agents.shipped"),
+    "models": (Models, _models, "rapid.teacher.models"),
+    "verify-simulator": (VerifySimulator, _verify, "rapid.simulator.verify"),
+    "doctor": (Doctor, _doctor, "rapid.doctor"),
 }
+"""For each verb its options, its action, and the module whose import takes the time before its first word."""

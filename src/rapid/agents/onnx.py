@@ -17,7 +17,7 @@ import numpy as np
 from rapid import files
 from rapid.agents.onnx_graph import build_model
 from rapid.agents.saved import QAgent, check_observations
-from rapid.errors import RapidError
+from rapid.errors import RapidError, how_to_install
 from rapid.networks.memory import initial_state, next_state
 from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, MIN_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
 
@@ -161,7 +161,7 @@ def export_onnx(
     try:
         import onnx
     except ImportError as error:
-        raise RapidError("Exporting needs onnx. Install it: pip install 'rapid-driving[export]'") from error
+        raise RapidError(f"Exporting needs onnx. Install it: {how_to_install('export')}") from error
     obs_BVF = check_observations(obs_BVF, agent.name, agent.vehicles)
     if not len(obs_BVF):
         raise RapidError("There are no observations to compare the exported model on. Give a dataset with transitions.")
@@ -238,5 +238,5 @@ def _import_onnxruntime() -> Any:
     try:
         import onnxruntime
     except ImportError as error:
-        raise RapidError("ONNX needs onnxruntime. Install it: pip install 'rapid-driving[export]'") from error
+        raise RapidError(f"ONNX needs onnxruntime. Install it: {how_to_install('export')}") from error
     return onnxruntime

@@ -20,7 +20,7 @@ import numpy as np
 from rapid.data.card import card
 from rapid.data.dataset import LICENCE, SCHEMA_VERSION, Dataset
 from rapid.data.transitions import Transitions, concatenate
-from rapid.errors import RapidError
+from rapid.errors import RapidError, how_to_install
 from rapid.files import atomic_path
 
 _KEPT = ("source_N", "episode_N", "step_N", "spawn_seed_N", "probabilities_NA")
@@ -263,5 +263,5 @@ def _need(module: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise RapidError(
-            f"This format needs the package '{Path(module).stem}'. Install it with: pip install 'rapid-driving[minari]'"
+            f"This format needs the package '{Path(module).stem}'. Install it: {how_to_install('minari')}"
         ) from error

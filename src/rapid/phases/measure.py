@@ -53,6 +53,8 @@ CRASHES = {"RAPID": 2}
 
 def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
     """Drive the agents named and write rows, table and plot to `out`; `teacher` is the configured teacher."""
+    if not specs:
+        raise RapidError(f"Which agents? Name their directories, ONNX files or drivers, such as {', '.join(FLOORS)}.")
     check(config)
     # Opened once: a language model takes long to load, and as much memory again.
     opened = {spec: _open(config, spec, config.scenario) for spec in specs}

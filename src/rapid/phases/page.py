@@ -1,5 +1,6 @@
 """The page of a run, gathered from what its steps left."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from rapid.evaluation.recording import Recording, load_recordings
 from rapid.files import read_json
 from rapid.phases.adapt import PPO
 from rapid.phases.data import data_folders
-from rapid.presets import of_file, without_presets
+from rapid.presets import as_options, of_file, without_presets
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.runs import STEPS
 from rapid.training.machinery.record import load_metrics
@@ -56,7 +57,7 @@ def write_run_report(config: Config, directory: Path) -> Path:
         settings=to_dict(config),
         versions=manifest["versions"],
         commit=manifest["commit"],
-        command=f"rapid run --config {directory / 'config.toml'} --directory {directory}",
+        command=shlex.join(["rapid", "run", *as_options(config), "--directory", f"{directory}-again"]),
         started=manifest["started"],
         timings={step: read_json(path)["seconds"] for step, path in steps.items() if path.exists()},
         rows=load_rows(directory / "evaluate" / "episodes.parquet"),
