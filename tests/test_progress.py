@@ -59,7 +59,7 @@ def test_durations(seconds: float, text: str):
 
 
 @pytest.mark.parametrize(
-    ("done", "total", "text"), [(1_234_567, 1e6, "1234567/1000000 MB"), (3.25, 144.0, "3.2/144 MB")]
+    ("done", "total", "text"), [(1_234_567, 2e6, "1234567/2000000 MB"), (3.25, 144.0, "3.2/144 MB")]
 )
 def test_counts_stand_in_full(monkeypatch: pytest.MonkeyPatch, done: float, total: float, text: str):
     now = [0.0]
