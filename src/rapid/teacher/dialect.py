@@ -79,7 +79,7 @@ def steps(dialect: Dialect, request: Request, may_lose_tools: bool) -> Iterator[
     roles = [message["role"] for message in request.messages]
     if "system" in roles and dialect.system:
         told = "the rules are told in the user's first turn"
-        yield Step(without(system=False), r"\bsystem|developer|\broles?\b|template|jinja", told)
+        yield Step(without(system=False), r"\bsystem|developer|template|jinja", told)
     if dialect.runs and any(
         later == before or (before, later) == ("tool", "user")
         for before, later in itertools.pairwise(roles)
@@ -152,7 +152,8 @@ def _messages(dialect: Dialect, given: Sequence[Message]) -> list[Message]:
         for message in messages:
             before = joined[-1] if joined else None
             role = message["role"]
-            if before and role != "tool" and (before["role"] == role or (before["role"], role) == ("tool", "user")):
+            after_a_tool = not dialect.runs and before and (before["role"], role) == ("tool", "user")
+            if before and role != "tool" and (before["role"] == role or after_a_tool):
                 text = "\n\n".join(part for part in (before["content"], message["content"]) if part)
                 joined[-1] = {**before, **message, "role": before["role"], "content": text}
             else:

@@ -8,6 +8,7 @@ step (:mod:`rapid.teacher.dialect`), and told once.
 import dataclasses
 import json
 import random
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -40,6 +41,7 @@ LOADING_WAIT = 600.0
 """Seconds that a server may take to load its model."""
 _LOADING_LOOK = 1.0
 """Seconds between two looks whether it has."""
+_LOADING = re.compile(r"\bloading\b|being loaded|not (yet )?(been )?loaded|warming up|starting up", re.IGNORECASE)
 _BETWEEN_LINES = 10.0
 """Seconds between two lines on a pause."""
 
@@ -59,7 +61,7 @@ class _PassingError(Exception):
     def __init__(self, message: str, refusal: Refusal | None = None) -> None:
         super().__init__(message)
         self.refusal = refusal
-        self.loading = refusal is not None and refusal.status == 503 and "load" in refusal.said.lower()
+        self.loading = refusal is not None and refusal.status == 503 and _LOADING.search(refusal.said) is not None
 
 
 class Endpoint:
@@ -166,7 +168,8 @@ class Endpoint:
             self._tell("It tells no sensible numbers of tokens: they are estimated, at 4 characters each.")
         if reply.model and reply.model != self._config.model:
             self._tell(f"The model that answers calls itself '{reply.model}'.")
-        return dataclasses.replace(reply, retries=retries[0])
+        # Probabilities that nobody asked for are of a decision that was made before, in the turns.
+        return dataclasses.replace(reply, retries=retries[0], tokens=reply.tokens if request.logprobs else ())
 
     def _names_a_step(self, words: str, request: Request, dialect: Dialect) -> bool:
         return any(step.is_meant(words) for step in steps(dialect, request, self._config.tool_calling == "auto"))

@@ -10,6 +10,8 @@ from rapid.teacher.prompt import WORDS
 
 TOP = 20
 """Alternatives asked for at each token; the most that servers commonly give."""
+LEAST_TOLD = 0.9
+"""Share of the probability that the alternatives must add up to: of what is left, nobody knows to whom it belongs."""
 
 _VALUE = re.compile(r'"action"\s*:\s*"')
 _LETTERS = re.compile(r"[^a-z]*([a-z]+)")
@@ -31,7 +33,7 @@ def action_probabilities(tokens: Sequence[Token], action: int, available: Sequen
     counts for an action if its letters begin the action's word. Actions that are not among the alternatives get 0.
 
     Returns:
-        Five numbers that add up to 1, or `None` if the tokens do not show where the decision fell.
+        Five numbers that add up to 1, or `None` if the tokens do not show where the decision fell, or how.
     """
     written = "".join(token.text for token in tokens)
     values = list(_VALUE.finditer(written))
@@ -43,6 +45,8 @@ def action_probabilities(tokens: Sequence[Token], action: int, available: Sequen
     for token in tokens:
         end += len(token.text)
         if end > start:
+            if sum(math.exp(min(logprob, 0.0)) for _, logprob in token.alternatives) < LEAST_TOLD:
+                return None
             for text, logprob in token.alternatives:
                 meant = _action_begun(text)
                 if meant is not None and meant in available:
