@@ -173,7 +173,7 @@ def test_killed_at_any_moment_the_same_command_ends_with_the_same_rows(tmp_path:
     def rows(store: Path) -> dict[str, list[tuple[object, ...]]]:
         found = {}
         for path in store.glob("drive/*/rows.parquet"):
-            kept = [replace(each, decision_ms=0.0, min_ttc=0.0) for each in load_rows(path)]
+            kept = [replace(each, decision_ms=0.0, min_ttc=0.0, commit="") for each in load_rows(path)]
             found[path.parent.name] = kept
         return found
 

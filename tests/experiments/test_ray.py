@@ -38,7 +38,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def rows(store: Store) -> list[list[EpisodeRow]]:
-    return [[replace(row, decision_ms=0.0, min_ttc=0.0) for row in store.rows(cell)] for cell in CELLS]
+    return [[replace(row, decision_ms=0.0, min_ttc=0.0, commit="") for row in store.rows(cell)] for cell in CELLS]
 
 
 def test_a_worker_and_a_node_may_die_in_the_middle(cluster: Any, tmp_path: Path):

@@ -255,7 +255,7 @@ def _router(shown: Router) -> Figure:
     bars.set_xlabel("vehicle, by distance")
     bars.set_ylabel("weight")
     bars.axhline(0, color="black", linewidth=0.8)
-    bars.legend(frameon=False, fontsize=9)
+    bars.legend(frameon=False, fontsize=9, loc="lower right", bbox_to_anchor=(1, 1), ncols=weights_VN.shape[1])
     for axes in (road, bars):
         axes.spines[["top", "right"]].set_visible(False)
     return figure
