@@ -29,7 +29,7 @@ check: $(VENV)/.installed-dev ## format, lint and type checks
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 
-docs: $(VENV)/.installed-docs ## build the documentation site into build/site
+docs: $(VENV)/.installed-dev ## build the documentation site into build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build -q
 	@echo 'Open build/site/index.html'
 
@@ -64,10 +64,5 @@ $(VENV)/.installed: $(VENV)/.torch pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo 'Installing the development tools ...'
-	@$(PIP) install -qq -c constraints.txt -e '.[dev,minari,export,sb3]'
-	@touch $@
-
-$(VENV)/.installed-docs: $(VENV)/.installed-dev
-	@echo 'Installing what builds the documentation ...'
-	@$(PIP) install -qq -c constraints.txt -e '.[docs]'
+	@$(PIP) install -qq -c constraints.txt -e '.[dev,minari,export,sb3,ray,docs]'
 	@touch $@
