@@ -22,7 +22,7 @@ from rapid.presets import preset
 from rapid.run import run
 from rapid.scenarios import PAPER_SCENARIOS
 from rapid.teacher import make_teacher
-from rapid.verbs import call
+from rapid.verbs import prepare
 
 SMALL = {
     "data": "shipped",
@@ -151,7 +151,7 @@ def test_data_of_another_scenario_is_refused(config: Config, tmp_path: Path):
 
 def test_a_shipped_set_stands_where_a_path_is_expected(tmp_path: Path):
     sets = [f"shipped:lane-3-density-2/{name}" for name in ("rule", "random")]
-    assert call("mix", [*sets, "--size", "40", "--out", str(tmp_path / "mixed")]) == 0
+    assert prepare("mix", [*sets, "--size", "40", "--out", str(tmp_path / "mixed")])() == 0
     assert load_dataset(tmp_path / "mixed").drivers["teacher"]["name"] == "rule-forecast"
     with pytest.raises(RapidError, match="did you mean 'lane-3-density-2/rule'"):
         load_dataset("shipped:lane-3-density-2/rules")
