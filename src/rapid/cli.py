@@ -28,6 +28,7 @@ VERBS: dict[str, str] = {
     "evaluate": "drive policies and scripted drivers over fixed spawns, clean and attacked",
     "teach-bench": "compare teachers, models and prompt styles on the same spawns",
     "export": "write an agent as ONNX, check it against the original, time it",
+    "import": "make an agent of a model that stable-baselines3 saved; nothing is unpickled",
     "report": "write the page of a run again",
     "reproduce": "every table and figure of the paper, obtained beside printed",
     "play": "open a live page: watch agents drive side by side, attack them, drive yourself",

@@ -238,6 +238,18 @@ class Export:
 
 
 @dataclass(frozen=True)
+class Import:
+    """Make an ONNX agent of a model that stable-baselines3 saved (MlpPolicy of DQN, PPO or A2C) and compare the two."""
+
+    model: Annotated[Positional[str], arg(metavar="MODEL.zip")]
+    """The file that model.save() wrote; its weights are read as tensors, nothing in it is run."""
+    trained_on: str = "highway-fast-v0"
+    """The scenario, or HighwayEnv's id, whose observations the model reads."""
+    out: str = ""
+    """The file; by default MODEL.onnx, beside the model."""
+
+
+@dataclass(frozen=True)
 class Report:
     """Write the page of a run again."""
 

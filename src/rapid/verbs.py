@@ -25,6 +25,7 @@ from rapid.options import (
     Doctor,
     Evaluate,
     Export,
+    Import,
     Mix,
     Models,
     Play,
@@ -224,6 +225,19 @@ def _export(options: Export, config: Config) -> int:
     return 0
 
 
+def _import(options: Import, config: Config) -> int:
+    from rapid.agents.sb3 import import_sb3
+
+    out = options.out or str(Path(options.model).with_suffix(".onnx"))
+    parity = import_sb3(options.model, out, options.trained_on)
+    print(
+        f"{out}\n{parity.observations} observations of {options.trained_on}: largest difference of values "
+        f"{parity.difference:.2g}, the same action on {parity.agreement:.2%}\n"
+        f"Next: rapid evaluate {out}"
+    )
+    return 0
+
+
 def _report(options: Report, config: Config) -> int:
     from rapid.phases.page import report_again
 
@@ -368,6 +382,7 @@ VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int], str]] = {
     "adversary": (Adversary, _adversary, "rapid.phases.adversary"),
     "teach-bench": (TeachBench, _teach_bench, "rapid.teach_bench"),
     "export": (Export, _export, "rapid.agents.onnx"),
+    "import": (Import, _import, "rapid.agents.sb3"),
     "report": (Report, _report, "rapid.phases.page"),
     "reproduce": (Reproduce, _reproduce, "rapid.experiments.reproduce"),
     "play": (Play, _play, "rapid.play"),

@@ -146,3 +146,16 @@ def test_weights_that_lack_a_tensor_are_refused(saved):
     edit(saved, weights_sha256=files.sha256(saved / "weights.safetensors"))
     with pytest.raises(RapidError, match="do not fit"):
         load_agent(saved)
+
+
+def test_what_a_notebook_shows_of_an_agent_is_a_line():
+    shown = repr(QAgent(make(vehicles=20), "pupil"))
+    assert "'pupil': reads 20 vehicles on 4 lanes" in shown
+    assert len(shown) < 120
+
+
+def test_one_observation_is_told_to_want_a_batch_axis(roads):
+    agent, obs = QAgent(make(), "pupil"), roads(2).numpy()
+    with pytest.raises(RapidError, match=r"batch axis.*obs\[None\]"):
+        agent.act(obs[0])
+    assert agent.act(obs[0][None]) == agent.act(obs)[:1]

@@ -79,6 +79,9 @@ class OnnxAgent:
         self.flat = len(shape) == 2
         self.name = name or Path(path).stem
 
+    def __repr__(self) -> str:
+        return f"<OnnxAgent '{self.name}': reads {self.vehicles} vehicles, {len(ACTIONS)} actions>"
+
     @property
     def mirrored_lanes(self) -> int | None:
         """On roads with how many lanes left is as good as right to it; None where it tells them apart."""

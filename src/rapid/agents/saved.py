@@ -20,7 +20,7 @@ from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
 from rapid.networks.memory import initial_state, next_state
 from rapid.networks.q_network import Explanation, QNetwork, build_network
-from rapid.scenarios import ACTIONS, FEATURES, NUM_FEATURES, NUM_VEHICLES
+from rapid.scenarios import ACTIONS, FEATURES, NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
 
 FORMAT = "rapid-agent"
 VERSION = 1
@@ -125,6 +125,13 @@ class QAgent:
         """Return the states (B, S) after these actions."""
         return next_state(state_BS, action_B, self.network.lanes)
 
+    def __repr__(self) -> str:
+        weights = sum(weight.numel() for weight in self.network.parameters())
+        return (
+            f"<QAgent '{self.name}': reads {self.vehicles} vehicles on {self.network.lanes} lanes, "
+            f"{weights:,} weights, {NUM_ACTIONS} actions>"
+        )
+
     def act(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> np.ndarray:
         """Return the greedy actions (B,), int64.
 
@@ -166,6 +173,11 @@ def check_observations(obs_BVF: np.ndarray, name: str, vehicles: int) -> np.ndar
         RapidError: they have the wrong shape or are not finite.
     """
     obs_BVF = np.ascontiguousarray(obs_BVF, np.float32)
+    if obs_BVF.shape == (vehicles, NUM_FEATURES):
+        raise RapidError(
+            f"Agent '{name}' was given one observation, {obs_BVF.shape}, but reads a batch, (batch, {vehicles}, "
+            f"{NUM_FEATURES}). Add a batch axis and take the first answer: agent.act(obs[None])[0]."
+        )
     if obs_BVF.ndim != 3 or obs_BVF.shape[1:] != (vehicles, NUM_FEATURES):
         raise RapidError(
             f"Agent '{name}' was given observations of shape {obs_BVF.shape}, but reads (batch, {vehicles}, "

@@ -45,6 +45,10 @@ class Dataset:
     memory: tuple[Experience, ...] | None = None
     """What the teacher remembered while it drove, and then what it learned; None if it has no memory."""
 
+    def __repr__(self) -> str:
+        mixed = f", mixed with p = {self.mixture['p']:g}" if self.mixture and "p" in self.mixture else ""
+        return f"<Dataset of {len(self):,} transitions of {self.scenario}, driven by {', '.join(self.drivers)}{mixed}>"
+
     def __len__(self) -> int:
         return len(self.transitions)
 
