@@ -155,3 +155,8 @@ def test_a_shipped_set_stands_where_a_path_is_expected(tmp_path: Path):
     assert load_dataset(tmp_path / "mixed").drivers["teacher"]["name"] == "rule-forecast"
     with pytest.raises(RapidError, match="did you mean 'lane-3-density-2/rule'"):
         load_dataset("shipped:lane-3-density-2/rules")
+
+
+def test_what_a_notebook_shows_of_a_dataset_is_a_line() -> None:
+    data = load_dataset(f"shipped:{PAPER_SCENARIOS[0]}/rule")
+    assert repr(data) == f"<Dataset of {len(data):,} transitions of lane-3-density-2, driven by teacher>"
