@@ -175,8 +175,8 @@ def check_observations(obs_BVF: np.ndarray, name: str, vehicles: int) -> np.ndar
     obs_BVF = np.ascontiguousarray(obs_BVF, np.float32)
     if obs_BVF.shape == (vehicles, NUM_FEATURES):
         raise RapidError(
-            f"Agent '{name}' was given one observation, of shape {obs_BVF.shape}, but reads a batch, (batch, {vehicles}, "
-            f"{NUM_FEATURES}). Add a batch axis and take the first answer: agent.act(obs[None])[0]."
+            f"Agent '{name}' was given one observation, of shape {obs_BVF.shape}, but reads a batch, "
+            f"(batch, {vehicles}, {NUM_FEATURES}). Add a batch axis and take the first answer: agent.act(obs[None])[0]."
         )
     if obs_BVF.ndim != 3 or obs_BVF.shape[1:] != (vehicles, NUM_FEATURES):
         raise RapidError(
