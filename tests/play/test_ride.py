@@ -1,12 +1,17 @@
 """One episode, decision by decision: the same as when it is measured, whoever drives and whatever is shown."""
 
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rapid.agents.saved import QAgent
+from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
+from rapid.networks.q_network import build_network
 from rapid.play.ride import KINDS, Ride, attack_spec
 from rapid.play.roster import Roster, You
 from rapid.scenarios import FASTER, IDLE, SLOWER
@@ -29,6 +34,17 @@ def test_a_ride_is_the_episode_that_is_measured(roster: Roster, saved: Path, key
     assert len(steps) == measured.length_E[0]
     assert sum(step["added"]["rewards"] for step in steps) == pytest.approx(measured.return_E[0], abs=2e-3)
     assert steps[-1]["crashed"] == measured.crashed_E[0]
+
+
+@pytest.mark.parametrize("attack", ["none", "pgd"])
+def test_an_agent_with_a_memory_remembers(attack: str) -> None:
+    settings = NetworkConfig(kind="rapid", width=16, layers=1, decoder_layers=1, heads=2, memory=True)
+    agent, spec = QAgent(build_network(settings, 3, seed=2).eval(), "remembering"), attack_spec(attack, 20)
+    steps = driven(Ride(agent, SCENARIO, 900_002), spec)
+    measured = run_episodes(agent, SCENARIO, [900_002], spec, record=True).recordings[0]
+    assert [step["added"]["actions"] for step in steps] == measured.action_T.tolist()
+    values = [step["added"]["q"] for step in steps]
+    np.testing.assert_allclose(values, measured.q_TA, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["uniform", "fgsm", "lie-far"])
@@ -86,7 +102,8 @@ def test_what_a_network_weighs_is_told(roster: Roster, saved: Path) -> None:
 def test_a_rule_says_why(roster: Roster) -> None:
     added = Ride(roster.open("rule", SCENARIO), SCENARIO, 900_000).step()["added"]
     assert added["q"] is None
-    assert added["answered"]
+    assert added["answered"] == ""  # no model was asked
+    assert added["computed"]
 
 
 def test_an_ended_episode_takes_no_more_decisions(roster: Roster) -> None:
@@ -104,3 +121,21 @@ def test_sizes_and_kinds_that_do_not_exist_are_refused(kind: str, metres: float)
 
 def test_no_size_is_no_attack() -> None:
     assert attack_spec("pgd", 0) == attack_spec("none", 20) == "none"
+
+
+def test_the_filter_is_asked_about_what_is_seen_within_the_size_of_the_attack(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, float]] = []
+
+    class Filter:
+        def __init__(self, lanes: int, radius: float) -> None:
+            asked.append((lanes, radius))
+
+        def margins(self, obs_BVF: np.ndarray) -> np.ndarray:
+            return np.array([[-1.0, 0.0, 5.0, -0.1, np.inf]])
+
+    module = types.ModuleType("rapid.safety")
+    module.IntervalFilter = Filter  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "rapid.safety", module)
+    told = Ride(You(), SCENARIO, 900_000).step(IDLE, "none", 0.05)["added"]["verdict"]
+    assert asked == [(3, 0.05)]
+    assert told == {"safe": [False, True, True, False, True], "spare": [-1.0, 0.0, 5.0, -0.1, 999.0]}

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.summary import label_of
+from rapid.pages.markup import plain
 from rapid.scenarios import ACTIONS, get_scenario
 
 ACTION_WORDS = tuple(name.replace("LANE_", "").lower() for name in ACTIONS)
@@ -73,9 +74,8 @@ def seen(seen_VF: NDArray[np.float32], true_VF: NDArray[np.float32]) -> list[lis
 
 
 def rounded(values: Any, digits: int = 4) -> Any:
-    """Return numbers, in whatever lists, with so many decimals."""
-    array = np.round(np.asarray(values, np.float64), digits)
-    return array.tolist()
+    """Return numbers, in whatever lists, with so many decimals; None where there is none, as JSON has no NaN."""
+    return plain(np.round(np.asarray(values, np.float64), digits))
 
 
 def side_by_side(recordings: Sequence[Recording]) -> list[dict[str, Any]]:

@@ -69,7 +69,7 @@ const who = (index) => ({ scenario: scenario.value, spawn: Number(spawn.value), 
 const attackNow = () => ({ attack: attack.value, metres: Number(size.value) });
 function showSize() {
   const share = Number(size.value) / data.along, lanes = data.scenarios.find(({ name }) => name === scenario.value)?.lanes ?? 3;
-  sizeWords.value = attack.value === "none" ? "" : `${size.value} m along, ${(share * 4 * lanes).toFixed(2)} m across, ${(share * 80).toFixed(1)} m/s (ε = ${+share.toFixed(4)})`;
+  sizeWords.value = attack.value === "none" ? "" : `${size.value} m along, ${+(share * 4 * lanes).toFixed(2)} m across, ${+(share * 80).toFixed(1)} m/s; ε = ${+share.toFixed(4)}`;
   size.disabled = attack.value === "none";
 }
 

@@ -101,12 +101,13 @@ function paintCar(pen, car, scale, fill, { ink, label, braking, ring, blink }) {
   pen.fillText(label, -long * 0.07, 0.5);
 }
 
-function paintGhost(pen, ghost, scale, X, Y) {
+function paintGhost(pen, ghost, scale, X, Y, masked) {
   const x = X(ghost.x), y = Y(ghost.y);
   pen.save();
   pen.strokeStyle = pen.fillStyle = color("--ghost");
   pen.lineWidth = 1.4;
-  if (ghost.car && Math.hypot(ghost.dx, ghost.dy) > 0.4) {
+  // Who drives by what is shown is not told where the cars really are.
+  if (ghost.car && !masked && Math.hypot(ghost.dx, ghost.dy) > 0.4) {
     pen.globalAlpha = 0.7;
     pen.setLineDash([2, 3]);
     pen.beginPath();
@@ -168,7 +169,7 @@ function paintRoad(pen, width, episode, time, look) {
     pen.restore();
   }
   if (ghosts && (look.ghosts || look.masked)) {
-    for (const ghost of ghosts) if (ghost.row || Math.hypot(ghost.dx, ghost.dy) > 0.4) paintGhost(pen, ghost, scale, X, Y);
+    for (const ghost of ghosts) if (ghost.row || Math.hypot(ghost.dx, ghost.dy) > 0.4) paintGhost(pen, ghost, scale, X, Y, look.masked && !ended);
   }
   if (wreck) paintCrash(pen, X(ego.x), Y(ego.y), scale);
 }

@@ -18,6 +18,7 @@ from rapid.evaluation.worlds import Perturbation
 from rapid.pages.episodes import frame, rounded, seen
 from rapid.play.roster import You
 from rapid.scenarios import ACTIONS, MAX_VEHICLES, NUM_ACTIONS, NUM_VEHICLES, get_scenario, seeing
+from rapid.teacher.decision import answer_in_words, computed_in_words
 
 ALONG = 200.0
 """What 1 means along the road, metres, in the features by which attacks are sized."""
@@ -135,9 +136,12 @@ class Ride:
             self._agent.next = check_action(action)
         worlds = np.zeros(1, np.int64)
         true_BVF = self._obs_BVF[:, : self._vehicles].copy()
-        seen_BVF = self._perturb(true_BVF.copy(), worlds, self._env)
+        # What an agent with a memory remembers: its attack knows it, and its values rest on it.
+        state_BS = self._driver.memory(worlds, 1)
+        state_BS = None if state_BS is None else state_BS.copy()
+        seen_BVF = self._perturb(true_BVF.copy(), worlds, self._env, state_BS)
         chosen = int(self._driver.choose(seen_BVF, worlds, self._spawn_B, self._step)[0])
-        added = self._commentary(seen_BVF, worlds) | {
+        added = self._commentary(seen_BVF, worlds, state_BS) | {
             "actions": chosen,
             "seen": seen(seen_BVF[0], true_BVF[0]),
             "verdict": verdict(seen_BVF, self._scenario.lanes, radius),
@@ -177,26 +181,24 @@ class Ride:
         made = None if text == "none" else get_attack(text, self._scenario.lanes)
         return Perturbation(made, self._agent, self._scenario.name, self._spawn_B, self._seed)
 
-    def _commentary(self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64]) -> dict[str, Any]:
+    def _commentary(
+        self, seen_BVF: NDArray[np.float32], worlds: NDArray[np.int64], state_BS: NDArray[np.float32] | None
+    ) -> dict[str, Any]:
         """Return what there is to say about the decision just made: values, routing, attention, words."""
-        q_A, _ = self._driver.commentary(seen_BVF, worlds)[0]
+        q_A, decision = self._driver.commentary(seen_BVF, worlds)[0]
         explain = getattr(self._agent, "explain", None)
-        found: Any = explain(seen_BVF) if callable(explain) else None
+        given = () if state_BS is None else (state_BS,)
+        found: Any = explain(seen_BVF, *given) if callable(explain) else None
         weights = None if found is None else found.weights_BVN
         attention = None if found is None else found.attention_BLHV
-        decision: Any = getattr(self._driver, "previous", {}).get(0)
-
-        def of(name: str) -> str | None:
-            return str(getattr(decision, name, "") or "") or None
-
         return {
             "q": None if q_A is None else rounded(q_A),
             "routing": None if weights is None else rounded(weights[0].cpu(), 3),
             "attention": None if attention is None else rounded(attention[0].mean((0, 1)).cpu(), 3),
-            "told": of("told"),
-            "answered": of("answer") or of("explanation"),
-            "odds": None if decision is None or decision.probabilities is None else rounded(decision.probabilities),
-            "computed": of("computed"),
+            "told": decision.told if decision else "",
+            "answered": answer_in_words(decision) if decision else "",
+            "odds": rounded(decision.probabilities) if decision and decision.probabilities else None,
+            "computed": computed_in_words(decision) if decision else "",
         }
 
 
