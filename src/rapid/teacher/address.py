@@ -36,8 +36,9 @@ class Address:
     tls: bool
     host: str
     port: int
-    path: str
-    query: str
+    path: str = field(repr=False)
+    """May hold a secret, as may the query."""
+    query: str = field(repr=False)
     proxy: Proxy | None
 
     @property
