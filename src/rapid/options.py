@@ -75,6 +75,8 @@ class Collect:
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
     out: str = "data/teacher"
     """Directory of the dataset."""
+    force: bool = False
+    """Replace what another command made in the place of the output."""
     scenario: str = Config.scenario
     """Where the teacher drives."""
     seed: Seed = Config.seed
@@ -90,8 +92,11 @@ class Relabel:
     """Directory of the dataset as it was collected, or a shipped set such as shipped:lane-3-density-2/teacher."""
     reward: Reward = "progress"
     """The reward that is wanted; `progress` counts distance and not crashing alone."""
-    out: str = "data/relabelled"
-    """Directory of the dataset with these rewards."""
+    out: str = ""
+    """Directory of the dataset with these rewards; by default data/relabelled, or data/relabelled-HASH
+    beside it if another command made that."""
+    force: bool = False
+    """Replace what another command made in the place of the output."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +108,11 @@ class Mix:
     random_data: Annotated[Positional[str], arg(metavar="RANDOM_DATA")]
     """Directory of the random dataset."""
     mix: Flat[MixConfig] = field(default_factory=MixConfig)
-    out: str = "data/mixed"
-    """Directory of the mixture."""
+    out: str = ""
+    """Directory of the mixture; by default data/mixed, or data/mixed-HASH
+    beside it if another command made that."""
+    force: bool = False
+    """Replace what another command made in the place of the output."""
     seed: Seed = Config.seed
     """Decides which transitions are drawn."""
     source: Flat[Source] = field(default_factory=Source)
@@ -118,8 +126,11 @@ class Distill:
     """Directory of the dataset."""
     distill: Flat[DistillConfig] = field(default_factory=DistillConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    out: str = "distilled"
-    """Directory of the agent and its training record."""
+    out: str = ""
+    """Directory of the agent and its training record; by default distilled, or distilled-HASH
+    beside it if another command made that."""
+    force: bool = False
+    """Replace what another command made in the place of the output."""
     curve_spawns: Count = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
     tracking: Tracking = Config.tracking
@@ -144,8 +155,11 @@ class Adapt:
     adapt: Flat[AdaptConfig] = field(default_factory=AdaptConfig)
     dataset: str = ""
     """Offline dataset: for --offline-share, which is 0 without it, and to measure what is forgotten."""
-    out: str = "adapted"
-    """Directory of the adapted agent and its training record."""
+    out: str = ""
+    """Directory of the adapted agent and its training record; by default adapted, or adapted-HASH
+    beside it if another command made that."""
+    force: bool = False
+    """Replace what another command made in the place of the output."""
     curve_spawns: Count = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
     tracking: Tracking = Config.tracking
@@ -170,8 +184,11 @@ class Evaluate:
     """Where they drive; by default where the saved agents were trained, else in lane-3-density-2."""
     simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
     """The compiled twin, or highway-env itself."""
-    out: str = "evaluation"
-    """Directory of the episodes, the table and the plot."""
+    out: str = ""
+    """Directory of the episodes, the table and the plot; by default evaluation, or evaluation-HASH
+    beside it if another command made that."""
+    force: bool = False
+    """Replace what another command made in the place of the output."""
     seed: Seed = Config.seed
     """Decides the noise of attacks and the random driver; the traffic is fixed by the spawn seeds."""
     source: Flat[Source] = field(default_factory=Source)
@@ -192,8 +209,11 @@ class Adversary:
     """The ball and the search in it, such as adversary:radius=0.05,ego=trusted (docs/attacks.md)."""
     steps: Annotated[int, arg(metavar="INT")] = EvaluateConfig.adversary_steps
     """Decisions to learn from."""
-    out: str = "adversary"
-    """Directory of the adversary."""
+    out: str = ""
+    """Directory of the adversary; by default adversary, or adversary-HASH
+    beside it if another command made that."""
+    force: bool = False
+    """Replace what another command made in the place of the output."""
     seed: Seed = Config.seed
     """Decides traffic, exploration, weights and batches."""
 
@@ -233,6 +253,8 @@ class Export:
     """Directory of the agent."""
     out: str = ""
     """The file; by default AGENT.onnx, beside the agent's directory."""
+    force: bool = False
+    """Replace another file in its place."""
     dataset: str = ""
     """Dataset whose observations are compared; without it, those that the agent meets on 32 test spawns."""
 
@@ -365,6 +387,8 @@ class VerifySimulator:
     Without it, on a processor with AVX-512, highway-env differs from itself elsewhere, visibly so after crashes."""
     out: str = ""
     """Also write the verdict to this file."""
+    force: bool = False
+    """Replace another file in its place."""
 
 
 @dataclass(frozen=True)

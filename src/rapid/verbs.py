@@ -8,7 +8,8 @@ import hashlib
 import importlib
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rapid.config import SCALES, Config, without_place
 from rapid.config_io import to_dict, to_toml
 from rapid.errors import RapidError
+from rapid.locks import exclusive, exclusive_file
 from rapid.options import (
     Adapt,
     Adversary,
@@ -37,9 +39,11 @@ from rapid.options import (
     TeachBench,
     VerifySimulator,
 )
+from rapid.outputs import DATASET, TRAINING, ClashError, check_new_file, claimed, clear, place_for
 from rapid.parsing import parse
 from rapid.presets import DEFAULT_PLAN, OF_RECIPE, differences, preset
 from rapid.scenarios import get_scenario
+from rapid.spawns import TrainPart
 
 if TYPE_CHECKING:
     from rapid.data.dataset import Dataset
@@ -83,7 +87,15 @@ def _collect(options: Collect, config: Config) -> int:
     check(config)
     # The random driver's transitions are the other source of a mixture, from spawns of their own.
     uniform = (config.teacher.backend, config.teacher.model) == ("scripted", "random")
-    dataset = collect_transitions(config, Path(options.out), "random" if uniform else "teacher")
+    out, source = Path(options.out), cast(TrainPart, "random" if uniform else "teacher")
+    with exclusive(out):
+        try:
+            dataset = collect_transitions(config, out, source)
+        except ClashError:
+            if not options.force:
+                raise
+            clear(out, DATASET)
+            dataset = collect_transitions(config, out, source)
     print(f"{len(dataset)} transitions in {options.out}")
     if not (dataset.collection or {}).get("complete", True):
         print("The budget is spent; the same command with a larger one goes on.", file=sys.stderr)
@@ -104,40 +116,60 @@ def _relabel(options: Relabel, config: Config) -> int:
     from rapid.data.relabel import relabel
     from rapid.progress import task
 
-    out = _new_folder(options.out)
     dataset = load_dataset(options.dataset)
     if get_scenario(dataset.scenario).reward == options.reward:
         raise RapidError(
             f"'{options.dataset}' has the reward '{options.reward}' already. Name the other with --reward."
         )
-    with task("relabel", len(dataset), "transitions") as progress:
-        save_dataset(relabel(dataset, options.reward, progress), out)
-    print(f"{len(dataset)} transitions in {options.out}")
+    with _claim(options, config, "data/relabelled", DATASET) as out:
+        with task("relabel", len(dataset), "transitions") as progress:
+            save_dataset(relabel(dataset, options.reward, progress), out)
+        print(f"{len(dataset)} transitions in {out}")
     return 0
 
 
 def _mix(options: Mix, config: Config) -> int:
     from rapid.phases.data import mix_datasets
 
-    out = _new_folder(options.out)
-    mixed = mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
-    print(f"{len(mixed)} transitions in {options.out}")
+    with _claim(options, config, "data/mixed", DATASET) as out:
+        mixed = mix_datasets(config, Path(options.teacher_data), Path(options.random_data), out)
+        print(f"{len(mixed)} transitions in {out}")
     _tell_fallbacks(mixed)
     return 0
 
 
-def _new_folder(path: str) -> Path:
-    """Return the path if nothing is there yet.
+_READ = ("dataset", "teacher_data", "random_data", "agent")
+"""Options that name what a verb reads: a dataset's or an agent's directory."""
 
-    Raises:
-        RapidError: there is something.
-    """
-    out = Path(path)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise RapidError(
-            f"'{out}' exists and is not an empty directory. Choose another --out, so that nothing is overwritten."
-        )
-    return out
+
+@contextmanager
+def _claim(options: Any, config: Config, usual: str, makes: Sequence[str]) -> Generator[Path, None, None]:
+    """Hold the directory of a verb's output; what it reads is told by its content, whatever it is called."""
+    own = {item.name: getattr(options, item.name) for item in dataclasses.fields(options)}
+    read = {name: own.pop(name) for name in _READ if own.get(name)}
+    settings = to_dict(without_place(config))
+    request = {
+        "verb": type(options).__name__.lower(),
+        "reads": {name: _content(name, path) for name, path in read.items()},
+        "threads": config.threads,
+        **{name: settings.get(name, value) for name, value in own.items() if name not in ("out", "force", "source")},
+    }
+    place = Path(options.out) if options.out else place_for(usual, request)
+    with claimed(place, request, makes, force=options.force, keep=map(Path, read.values())) as out:
+        yield out
+
+
+def _content(name: str, path: str) -> str:
+    """Return the hash of a dataset or an agent, whose records name those of their files."""
+    from rapid.agents.shipped import agent_folder
+    from rapid.data.shipped import dataset_folder
+    from rapid.files import sha256
+
+    folder = agent_folder(path) if name == "agent" else dataset_folder(path)
+    for record in (folder / "dataset.json", folder / "config.json", folder):
+        if record.is_file():
+            return sha256(record)
+    raise RapidError(f"There is neither a dataset nor an agent at '{path}'. Check the path, or make it first.")
 
 
 def _distill(options: Distill, config: Config) -> int:
@@ -145,13 +177,14 @@ def _distill(options: Distill, config: Config) -> int:
     from rapid.phases.distill import distill_agent, distill_seeds
 
     check(config)
-    if options.seeds == 1:
-        distill_agent(config, Path(options.dataset), Path(options.out), tell=_tell_fallbacks)
-        print(f"The agent is in {options.out}/agent")
-        return 0
-    seeds = range(config.seed, config.seed + options.seeds)
-    for home in distill_seeds(config, Path(options.dataset), Path(options.out), seeds, tell=_tell_fallbacks):
-        print(f"An agent is in {home}/agent")
+    with _claim(options, config, "distilled", TRAINING) as out:
+        if options.seeds == 1:
+            distill_agent(config, Path(options.dataset), out, tell=_tell_fallbacks)
+            print(f"The agent is in {out}/agent")
+            return 0
+        seeds = range(config.seed, config.seed + options.seeds)
+        for home in distill_seeds(config, Path(options.dataset), out, seeds, tell=_tell_fallbacks):
+            print(f"An agent is in {home}/agent")
     return 0
 
 
@@ -161,25 +194,25 @@ def _adapt(options: Adapt, config: Config) -> int:
 
     check(config)
     dataset = Path(options.dataset) if options.dataset else None
-    adapt_agent(config, Path(options.agent), dataset, Path(options.out))
-    print(f"The agent is in {options.out}/agent")
+    with _claim(options, config, "adapted", TRAINING) as out:
+        adapt_agent(config, Path(options.agent), dataset, out)
+        print(f"The agent is in {out}/agent")
     return 0
 
 
 def _evaluate(options: Evaluate, config: Config) -> int:
     from rapid.phases.measure import compare
 
-    compare(config, options.agents, Path(options.out))
-    print((Path(options.out) / "summary.txt").read_text(encoding="utf-8"))
+    compare(config, options.agents, options.out, options.force, say=print)
     return 0
 
 
 def _adversary(options: Adversary, config: Config) -> int:
     from rapid.phases.adversary import train
 
-    out = _new_folder(options.out)
-    before, after = train(options.agent, options.scenario, options.attack, options.steps, out, options.seed)
-    print(f"The adversary is in {out}; in training the agent's return went from {before:.2f} to {after:.2f}")
+    with _claim(options, config, "adversary", ("*",)) as out:
+        before, after = train(options.agent, options.scenario, options.attack, options.steps, out, options.seed)
+        print(f"The adversary is in {out}; in training the agent's return went from {before:.2f} to {after:.2f}")
     return 0
 
 
@@ -216,7 +249,9 @@ def _export(options: Export, config: Config) -> int:
     else:
         scenario = str(agent.metadata.get("scenario") or config.scenario)
         obs_BVF, state_BS = driven_observations(agent, scenario, spawn_seeds("test", 32))
-    parity = export_onnx(agent, out, obs_BVF, state_BS)
+    with exclusive_file(out):
+        check_new_file(Path(out), options.force)
+        parity = export_onnx(agent, out, obs_BVF, state_BS)
     print(
         f"{out}\n{parity.observations} observations: largest difference of Q-values {parity.difference:.2g}, "
         f"the same action on {parity.agreement:.2%}\n"
@@ -241,7 +276,11 @@ def _import(options: Import, config: Config) -> int:
 def _report(options: Report, config: Config) -> int:
     from rapid.phases.page import report_again
 
-    print(report_again(Path(options.directory)))
+    directory = Path(options.directory)
+    if not (directory / "run.json").exists():
+        raise RapidError(f"There is no run at '{directory}'. Check the path, or make it first: rapid run")
+    with exclusive(directory):
+        print(report_again(directory))
     return 0
 
 
@@ -342,6 +381,8 @@ def _verify(options: VerifySimulator, config: Config) -> int:
     from rapid.progress import task
     from rapid.simulator.verify import verify
 
+    if options.out:
+        check_new_file(Path(options.out), options.force)
     with task("verify", options.episodes, "episodes") as work:
         findings = verify(
             options.scenarios or None,

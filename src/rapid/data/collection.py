@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from rapid.data.dataset import DATASET_FILE, Dataset, load_dataset, save_dataset
+from rapid.data.dataset import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE, Dataset, load_dataset, save_dataset
 from rapid.data.driving import JOURNAL_FILE, Budget, Collecting, MakeWorlds, SpentError, Tally
-from rapid.data.journal import check_settings
+from rapid.data.journal import check_settings, check_unclaimed
 from rapid.data.parts import LIST_FILE
 from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
 from rapid.errors import RapidError
@@ -140,6 +140,8 @@ def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
         before = read_json(work / "settings.json", "record of the collection")
     elif (work / JOURNAL_FILE).exists() or any(work.glob("part-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
+    else:
+        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE))
     check_settings(root, before, settings)
     if dataset is None or not dataset.collection or not dataset.collection["complete"]:
         if dataset is not None and not (work / "settings.json").exists():

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rapid.config_io import differences
 from rapid.errors import RapidError
 from rapid.files import AppendedFile, truncate
+from rapid.outputs import ClashError
 from rapid.progress import warn
 from rapid.teacher.decision import Decision, from_record, to_record
 
@@ -165,10 +166,23 @@ def check_settings(root: Path, before: dict[str, Any] | None, settings: dict[str
     """Raise unless a collection in `root` was begun with these settings, or (None) not begun.
 
     Raises:
-        RapidError: the settings differ; the message names them.
+        ClashError: the settings differ; the message names them.
     """
     if before is not None and before != settings:
-        raise RapidError(
+        raise ClashError(
             f"'{root}' was collected with other settings: {differences(before, settings)}. Nothing was changed. Use "
             "the same settings to go on, choose another directory, or replace what is there with --force."
+        )
+
+
+def check_unclaimed(root: Path, names: Sequence[str]) -> None:
+    """Raise unless a directory in which nothing was collected is free of files that a dataset would replace.
+
+    Raises:
+        ClashError: one of `names` is there.
+    """
+    if found := [name for name in names if (root / name).exists()]:
+        raise ClashError(
+            f"'{root}' holds {found[0]}, but nothing says that it was collected there. Nothing was changed. Choose "
+            "another directory, or replace what is there with --force."
         )

@@ -20,7 +20,7 @@ import pyarrow as pa
 from rapid.data.collection import collect, identity
 from rapid.data.dataset import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE, Dataset, join, load_dataset, save_dataset
 from rapid.data.driving import Budget, MakeWorlds, SpentError, Tally
-from rapid.data.journal import check_settings
+from rapid.data.journal import check_settings, check_unclaimed
 from rapid.data.transitions import SOURCES, concatenate
 from rapid.engines import Engine, Report, check_engine, run_jobs
 from rapid.errors import RapidError
@@ -303,6 +303,8 @@ def _check_same(root: Path, settings: dict[str, Any], dataset: Dataset | None) -
         before = (dataset.collection or {}).get("settings", {})
     elif any(work.glob("shard-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
+    else:
+        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE))
     check_settings(root, before, settings)
 
 

@@ -104,7 +104,7 @@ def save_rows(path: str | os.PathLike[str], rows: Iterable[EpisodeRow]) -> None:
         for row in rows
     ]
     with atomic_path(path) as temporary:
-        pq.write_table(pa.Table.from_pylist(records, SCHEMA), temporary, compression="zstd")
+        pq.write_table(pa.Table.from_pylist(records, SCHEMA), temporary, compression="zstd", write_page_checksum=True)
 
 
 def load_rows(path: str | os.PathLike[str]) -> list[EpisodeRow]:

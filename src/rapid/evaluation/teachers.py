@@ -103,7 +103,7 @@ def save_teacher_rows(path: str | os.PathLike[str], rows: Iterable[TeacherRow]) 
     for record in records:
         record |= {name: None for name, value in record.items() if isinstance(value, float) and math.isnan(value)}
     with atomic_path(path) as temporary:
-        pq.write_table(pa.Table.from_pylist(records, SCHEMA), temporary, compression="zstd")
+        pq.write_table(pa.Table.from_pylist(records, SCHEMA), temporary, compression="zstd", write_page_checksum=True)
 
 
 def load_teacher_rows(path: str | os.PathLike[str]) -> list[TeacherRow]:

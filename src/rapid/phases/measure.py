@@ -18,17 +18,18 @@ from rapid.attacks.suite import PRESETS, expand
 from rapid.config import Config, without_place
 from rapid.config_io import to_dict
 from rapid.engines import run_jobs
-from rapid.errors import RapidError
+from rapid.errors import DamagedError, RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, explained_by, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
 from rapid.evaluation.worst import worst_text
-from rapid.files import read_json, sha256, write_json, write_text
+from rapid.files import sha256, write_text
 from rapid.networks.q_network import QNetwork
+from rapid.outputs import EVALUATION, claimed, place_for
 from rapid.phases.checks import check
 from rapid.phases.data import given_data
-from rapid.progress import task
+from rapid.progress import task, warn
 from rapid.report import ReportData, write_figures
 from rapid.report.figures import save_figure
 from rapid.report.sweep import sweep_figure, sweep_text
@@ -51,8 +52,22 @@ CRASHES = {"RAPID": 2}
 """Crashes of an agent under each attack that the report can play; of other learned agents, one."""
 
 
-def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]:
-    """Drive the agents named and write rows, table and plot to `out`; `teacher` is the configured teacher."""
+def compare(
+    config: Config,
+    specs: Sequence[str],
+    out: str | Path = "",
+    force: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> list[EpisodeRow]:
+    """Drive the agents named and write rows, table and plot; `teacher` is the configured teacher.
+
+    Args:
+        config: where and how they drive.
+        specs: the agents.
+        out: the directory; empty is ``evaluation``, or one beside it if that holds another comparison.
+        force: replace another comparison there.
+        say: is given the table, and where all of it is.
+    """
     if not specs:
         raise RapidError(f"Which agents? Name their directories, ONNX files or drivers, such as {', '.join(FLOORS)}.")
     check(config)
@@ -64,6 +79,7 @@ def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]
     files = [Path(spec) / "config.json" if Path(spec).is_dir() else Path(spec) for spec in specs]
     settings = to_dict(without_place(config).evaluate)
     request = {
+        "threads": config.threads,
         "agents": [[spec, sha256(file) if file.is_file() else ""] for spec, file in zip(specs, files, strict=True)],
         "teacher": to_dict(config.teacher) if TEACHER in specs else None,
         "scenario": config.scenario,
@@ -71,17 +87,17 @@ def compare(config: Config, specs: Sequence[str], out: Path) -> list[EpisodeRow]
         "seed": config.seed,
         "evaluate": {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()},
     }
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        if not (out / "request.json").exists() or read_json(out / "request.json") != request:
-            raise RapidError(f"'{out}' holds something else than this comparison. Choose another --out, or empty it.")
-    else:
-        write_json(out / "request.json", request)
-    if set(specs).isdisjoint(FLOORS) and any(text.partition(":")[0] in PRESETS for text in config.evaluate.attacks):
-        floors = floors_under_attack(config.scenario)
-        opened |= {spec: _open(config, spec, config.scenario) for spec in floors}
-        specs = [*specs, *floors]
-    rows = measure(config, config.scenario, specs, out, labels, opened)
-    write_figures(ReportData(title=f"{config.scenario}", rows=rows), out)
+    place = Path(out) if out else place_for("evaluation", request)
+    with claimed(place, request, EVALUATION, force=force, keep=map(Path, specs)):
+        if set(specs).isdisjoint(FLOORS) and any(text.partition(":")[0] in PRESETS for text in config.evaluate.attacks):
+            floors = floors_under_attack(config.scenario)
+            opened |= {spec: _open(config, spec, config.scenario) for spec in floors}
+            specs = [*specs, *floors]
+        rows = measure(config, config.scenario, specs, place, labels, opened)
+        write_figures(ReportData(title=f"{config.scenario}", rows=rows), place)
+        if say:
+            say((place / "summary.txt").read_text(encoding="utf-8"))
+            say(f"Rows, table and plot: {place}")
     return rows
 
 
@@ -146,7 +162,8 @@ def measure(
         if not spec:
             continue
         part = out / "parts" / f"{number:02}.parquet"
-        if not part.exists():
+        kept = _kept(part)
+        if kept is None:
             agent = opened[spec] if opened else _open(config, spec, scenario)
             if labels and spec in labels:
                 agent.name = labels[spec]
@@ -162,13 +179,25 @@ def measure(
             save_rows(
                 part, [row for of in episodes for row in of.rows(config.seed if of.has_network else None, source)]
             )
-        rows += load_rows(part)
+            kept = load_rows(part)
+        rows += kept
     save_rows(out / "episodes.parquet", rows)
     texts = (summary_text(rows), worst_text(rows), sweep_text(rows))
     write_text(out / "summary.txt", "\n\n".join(text for text in texts if text) + "\n")
     if (figure := sweep_figure(rows)) is not None:
         save_figure(figure, out / "sweep.png")
     return rows
+
+
+def _kept(part: Path) -> list[EpisodeRow] | None:
+    """Return what was measured of an agent before; None if it has to be driven."""
+    if not part.exists():
+        return None
+    try:
+        return load_rows(part)
+    except DamagedError as error:
+        warn(f"{error} The agent is driven again.")
+        return None
 
 
 def _with_adversary(config: Config, scenario: str, agent: Any, attack: AttackSpec, out: Path) -> AttackSpec:

@@ -1,0 +1,162 @@
+"""Where verbs put what they make: nothing of anybody else's is replaced, and what differs is said."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from rapid.cli import main
+from rapid.errors import RapidError
+from rapid.locks import exclusive
+from rapid.outputs import ClashError, claimed, clear, place_for
+
+REQUEST = {"verb": "mix", "mix": {"p": 0.5, "size": 100}, "reads": {"dataset": "abc"}}
+OTHER = {**REQUEST, "mix": {"p": 0.25, "size": 100}}
+
+
+def make(place: Path, request: dict, force: bool = False, **options) -> None:
+    with claimed(place, request, ("made*",), force=force, **options):
+        (place / "made.txt").write_text(str(request))
+
+
+def contents(place: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(place)): path.read_bytes() for path in place.rglob("*") if path.is_file()}
+
+
+def test_the_same_request_goes_on_and_another_is_told_what_differs(tmp_path: Path):
+    place = tmp_path / "a" / "out"
+    make(place, REQUEST)
+    before = contents(place)
+    make(place, REQUEST)
+    assert contents(place) == before
+    with pytest.raises(ClashError, match=r"mix\.p: 0\.5 there, 0\.25 now\)\. Nothing was changed"):
+        make(place, OTHER)
+    assert contents(place) == before
+    make(place, OTHER, force=True)
+    assert contents(place)["made.txt"] != before["made.txt"]
+    make(place, OTHER)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_what_somebody_else_put_there_stays(tmp_path: Path, force: bool):
+    (tmp_path / "thesis.txt").write_text("mine")
+    (tmp_path / "made.txt").write_text("mine, too")
+    before = contents(tmp_path)
+    with pytest.raises(ClashError, match=r"thesis\.txt"):
+        make(tmp_path, REQUEST, force)
+    assert contents(tmp_path) == before
+
+
+def test_what_is_read_is_not_removed(tmp_path: Path):
+    make(tmp_path, REQUEST)
+    with pytest.raises(ClashError, match="is read by this command"):
+        make(tmp_path, OTHER, True, keep=[tmp_path / "made.txt"])
+    assert (tmp_path / "made.txt").exists()
+
+
+def test_force_removes_links_not_what_they_lead_to(tmp_path: Path):
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "x").write_text("mine")
+    make(tmp_path / "out", REQUEST)
+    (tmp_path / "out" / "made-link").symlink_to(tmp_path / "precious")
+    clear(tmp_path / "out", ("made*",))
+    assert not list((tmp_path / "out").iterdir())
+    assert (tmp_path / "precious" / "x").read_text() == "mine"
+
+
+def test_a_request_that_came_to_nothing_leaves_nothing(tmp_path: Path):
+    with pytest.raises(RapidError, match="refused"), claimed(tmp_path / "out", REQUEST, ()):
+        raise RapidError("refused")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_record_blocks_only_without_force(tmp_path: Path):
+    make(tmp_path, REQUEST)
+    (tmp_path / "request.json").write_bytes(bytes(100))
+    with pytest.raises(ClashError, match=r"damaged request\.json"):
+        make(tmp_path, REQUEST)
+    make(tmp_path, REQUEST, force=True)
+
+
+def test_without_a_place_the_second_request_goes_beside_the_first(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        first, second = place_for("out", REQUEST), place_for("out", OTHER)
+        if first == Path("out"):
+            make(first, REQUEST)
+        second = place_for("out", OTHER)
+        make(second, OTHER)
+        assert first == Path("out")
+        assert str(second).startswith("out-")
+    # It stays there, also once the usual place is free.
+    for path in Path("out").iterdir():
+        path.unlink()
+    assert place_for("out", OTHER) == second
+
+
+MIX = ("mix", "shipped:lane-3-density-2/rule", "shipped:lane-3-density-2/random", "--size", "100")
+DISTILL = ("distill", "shipped:lane-3-density-2/rule", "--iterations", "2", "--evaluate-every", "0", "--network.kind")
+COLLECT = ("collect", "--teacher.backend", "scripted", "--teacher.model", "slower", "--teacher-transitions", "30")
+EVALUATE = ("evaluate", "slower", "--spawns", "1", "--attacks", "none", "--seed")
+
+
+def run(*words: str) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    return int(str(stop.value.code))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "differs"),
+    [
+        ((*MIX, "--p", "0.5"), (*MIX, "--p", "0.25"), "mix.p: 0.5 there, 0.25 now"),
+        ((*DISTILL, "mlp"), (*DISTILL, "mlp", "--seed", "1"), "seed: 0 there, 1 now"),
+        (COLLECT, (*COLLECT[:4], "idle", *COLLECT[5:]), "driver.name: 'slower' there, 'idle' now"),
+        ((*EVALUATE, "0"), (*EVALUATE, "1"), "seed: 0 there, 1 now"),
+    ],
+)
+def test_every_verb_leaves_what_another_made_and_says_what_differs(
+    tmp_path, monkeypatch, capsys, first, second, differs
+):
+    monkeypatch.chdir(tmp_path)
+    assert run(*first, "--out", "out") == 0
+    before = contents(tmp_path)
+    assert run(*second, "--out", "out") == 2
+    said = capsys.readouterr().err
+    assert differs in said
+    assert "--force" in said
+    assert contents(tmp_path) == before
+    with exclusive(tmp_path / "out"), ThreadPoolExecutor() as pool:  # a lock is a thread's
+        assert pool.submit(run, *first, "--out", "out").result() == 2
+    assert "Another process is at work" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+    assert run(*second, "--out", "out", "--force") == 0
+    assert contents(tmp_path) != before
+
+
+def test_a_file_of_the_users_is_not_collected_over(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "transitions.parquet").write_text("mine")
+    for _ in range(2):
+        assert run(*COLLECT, "--out", "out") == 2
+        assert "nothing says that it was collected there" in capsys.readouterr().err
+        assert contents(tmp_path) == {"out/transitions.parquet": b"mine"}
+
+
+def test_evaluate_without_agents_leaves_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("evaluate") == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_exported_file_is_not_replaced(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("onnx")
+    monkeypatch.chdir(tmp_path)
+    assert run(*DISTILL, "mlp", "--out", "out") == 0
+    (tmp_path / "a.onnx").write_text("mine")
+    words = ("export", "out/agent", "--dataset", "shipped:lane-3-density-2/rule", "--out", "a.onnx")
+    assert run(*words) == 2
+    assert (tmp_path / "a.onnx").read_text() == "mine"
+    assert run(*words, "--force") == 0
+    assert (tmp_path / "a.onnx").stat().st_size > 1000
