@@ -166,6 +166,9 @@ class NetworkConfig:
     memory: bool = False
     """Give it a memory of what a car knows by itself: the time, its own speed and lanes, dead-reckoned from its own
     actions, which no attack on observations moves. For networks of tokens that do not average with the mirror image."""
+    shield: str = ""
+    """Behind the Q-values, the interval filter (`rapid.safety`) that lets an action pass only if it is safe in every
+    true state within this of what is seen: a radius such as 0.1, or metres and m/s such as 1m,0.5; nothing is none."""
 
 
 @dataclass(frozen=True)
@@ -372,6 +375,9 @@ class AdaptConfig:
     """Set `network.mirror` from this phase on; without this an agent keeps what it has."""
     memory: bool = False
     """Set `network.memory` from PPO on; without this an agent keeps what it has."""
+    shield: str = ""
+    """Set `network.shield` from this phase on, so that the policy learns behind the filter; nothing leaves it as it
+    is."""
     evaluate_every: Count = 1_000
     """Environment steps between two evaluations; 0 is never."""
     loss: LossConfig = field(default_factory=lambda: LossConfig(conservative_weight=0.2, robust_weight=0.0, n_step=3))

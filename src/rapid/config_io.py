@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 from rapid.bounds import check_bounds
 from rapid.config import Config, PpoConfig
 from rapid.errors import RapidError, did_you_mean
+from rapid.safety import read_box
 from rapid.scenarios import get_scenario
 
 T = TypeVar("T")
@@ -109,6 +110,8 @@ def validate(config: Config) -> Config:
     if config.adapt.scenario:
         get_scenario(config.adapt.scenario)
     collect, network, adapt = config.collect, config.network, config.adapt
+    for box in filter(None, (network.shield, adapt.shield)):
+        read_box(box, lanes=1)
     divided = max(collect.workers, collect.shards) > 1
     checks: list[tuple[str, bool, str]] = [
         (

@@ -176,9 +176,9 @@ class Evaluate:
     """Compare agents over the same fixed spawns, clean and under attacks, in one table and one plot."""
 
     agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
-    """Directories of agents, ONNX files, and drivers by name: slower, idle, faster, random, rule, rule-forecast,
-    rule-foresight, uniform-safe, immune, blind, planner, planner-cars, planner-observation, teacher (the one of
-    --config)."""
+    """Directories of agents, ONNX files, and drivers by name, each with shield:BOX: before it if it is to drive behind
+    the interval filter (shield:0.1:slower): slower, idle, faster, random, rule, rule-forecast, rule-foresight,
+    uniform-safe, immune, blind, planner, planner-cars, planner-observation, teacher (the one of --config)."""
     evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
     scenario: str = ""
     """Where they drive; by default where the saved agents were trained, else in lane-3-density-2."""
@@ -250,7 +250,7 @@ class Export:
     """Write an agent as ONNX, compare the two on real observations, and time a decision."""
 
     agent: Annotated[Positional[str], arg(metavar="AGENT")]
-    """Directory of the agent."""
+    """Directory of the agent; with shield:BOX: before it, the interval filter becomes part of the model."""
     out: str = ""
     """The file; by default AGENT.onnx, beside the agent's directory."""
     force: bool = False

@@ -236,13 +236,13 @@ def _export(options: Export, config: Config) -> int:
     import torch
 
     from rapid.agents.onnx import driven_observations, export_onnx, latency
-    from rapid.agents.saved import load_agent
+    from rapid.agents.open import network_agent
     from rapid.data.batch import with_rows
     from rapid.data.dataset import load_dataset
     from rapid.spawns import spawn_seeds
 
-    agent, folder = load_agent(options.agent), Path(options.agent)
-    out = options.out or f"{folder.resolve()}.onnx"
+    agent = network_agent(options.agent)
+    out = options.out or f"{Path(options.agent.rpartition(':')[2]).resolve()}.onnx"
     if options.dataset:
         obs_NVF = load_dataset(options.dataset).transitions.obs_NVF
         obs_BVF, state_BS = with_rows(torch.from_numpy(obs_NVF), agent.vehicles).numpy(), None

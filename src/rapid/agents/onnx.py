@@ -92,6 +92,11 @@ class OnnxAgent:
         """On roads with how many lanes its memory is right; None where it has none."""
         return int(self.metadata["lanes"]) if self.has_memory else None
 
+    @property
+    def shielded_lanes(self) -> int | None:
+        """For roads with how many lanes its safety filter is; None where it has none."""
+        return self.metadata.get("shielded_lanes")
+
     def start(self, worlds: int) -> np.ndarray:
         """Return the states (B, S), float32, with which episodes begin."""
         return initial_state(worlds, int(self.metadata["lanes"]))
@@ -176,6 +181,8 @@ def export_onnx(
         "actions": ACTIONS,
         "mirrored_lanes": agent.mirrored_lanes,
         "memory": agent.has_memory,
+        "shielded_lanes": agent.shielded_lanes,
+        "shield": network.config.shield,
     }
     if agent.has_memory and state_BS is None:
         state_BS = agent.start(len(obs_BVF))

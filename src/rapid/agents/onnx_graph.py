@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rapid.agents.onnx_arrays import Arrays
 from rapid.networks.blocks import Block, Transformer
 from rapid.networks.encoding import BESIDE, NEAR, NEAR_FEATURES
 from rapid.networks.memory import STATE_SIZE
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.mlp import MlpHead
 from rapid.networks.q_network import MIRRORED_ACTIONS, ActionDecoder, QNetwork, TokenHead
+from rapid.safety import filter_values, margins, read_box
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES
 
 if TYPE_CHECKING:
@@ -112,6 +114,15 @@ def build_model(network: QNetwork) -> Any:
 
 
 def _q_values(graph: Graph, network: QNetwork) -> str:
+    q = _unfiltered(graph, network)
+    if not network.config.shield:
+        return q
+    arrays = Arrays(graph)
+    box = read_box(network.config.shield, network.lanes)
+    return filter_values(arrays, arrays.of(q), margins(arrays, arrays.of("obs"), network.lanes, box)).name
+
+
+def _unfiltered(graph: Graph, network: QNetwork) -> str:
     if not network.config.mirror:
         return _seen(graph, network, "obs")
     # The road and its mirror image as one batch.

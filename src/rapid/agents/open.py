@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast, get_args
+from typing import TYPE_CHECKING, Any, Protocol, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,19 @@ from rapid.agents.shipped import agent_folder, is_shipped
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import Kind
 from rapid.files import read_json
+from rapid.safety import read_box
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision
 
+if TYPE_CHECKING:
+    from rapid.agents.saved import QAgent
+
 PLANNERS = ("planner", "planner-cars", "planner-observation")
 """Searches in the simulator: with perfect knowledge, of all cars but not of their drivers, and of what is observed."""
+
+SHIELD = "shield:"
+"""How the spec of an agent behind the interval filter begins."""
 
 Said = tuple[NDArray[np.float32] | None, Decision | None]
 """The values of the actions, if the driver has any, and its decision, if it is one that speaks."""
@@ -45,6 +52,9 @@ class Driver(Protocol):
 def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> Any:
     """Return the agent that `spec` names: a saved agent's directory, an ONNX file, or a driver's name.
 
+    Before any of them may stand ``shield:BOX:``, which puts the interval filter around it (:mod:`rapid.safety`), with
+    a radius such as 0.1 or metres and m/s such as 1m,0.5.
+
     `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are; `device` is where a
     saved agent's network goes.
 
@@ -53,6 +63,17 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
     """
     from rapid.teacher.scripted import SCRIPTED, Scripted
 
+    if spec.startswith(SHIELD):
+        from rapid.agents.shielded import shielded
+
+        box, colon, inner = spec[len(SHIELD) :].partition(":")
+        if not colon or not inner:
+            raise RapidError(
+                f"'{spec}' does not say what is shielded. Expected shield:BOX:AGENT, such as shield:0.1:slower."
+            )
+        lanes = get_scenario(scenario).lanes
+        read_box(box, lanes)
+        return shielded(open_agent(inner, scenario, seed, device), box, lanes)
     if spec in SCRIPTED or spec.startswith("blind:"):
         return Scripted(spec, get_scenario(scenario).lanes, seed, scenario)
     if spec in PLANNERS:
@@ -83,6 +104,8 @@ def own_scenario(specs: Sequence[str]) -> str:
     """
     found: dict[str, str] = {}
     for spec in specs:
+        while spec.startswith(SHIELD):
+            spec = spec[len(SHIELD) :].partition(":")[2]
         path = agent_folder(spec) / "config.json"
         if path.is_file():
             metadata = read_json(path, "agent").get("metadata", {})
@@ -94,11 +117,26 @@ def own_scenario(specs: Sequence[str]) -> str:
     return next(iter(found), "")
 
 
-def check_road(agent: Any, scenario: str) -> None:
-    """Check that what an agent takes for the mirror image of the road is that, and the road its memory knows.
+def network_agent(spec: str, device: str = "cpu") -> "QAgent":
+    """Return the agent with a network that `spec` names: a saved agent's directory, perhaps behind ``shield:BOX:``.
 
     Raises:
-        RapidError: it was made alike to left and right, or remembers, on a road with another number of lanes.
+        RapidError: `spec` names none, or another kind of agent.
+    """
+    from rapid.agents.shielded import shielded
+
+    if spec.startswith(SHIELD):
+        box, _, inner = spec[len(SHIELD) :].partition(":")
+        agent = network_agent(inner, device)
+        return shielded(agent, box, agent.network.lanes)
+    return rapid.load_agent(spec, device)
+
+
+def check_road(agent: Any, scenario: str) -> None:
+    """Check that what an agent takes for the mirror image of the road is that, and the road its memory or filter knows.
+
+    Raises:
+        RapidError: it was made alike to left and right, remembers, or has a filter, on a road with other lanes.
     """
     lanes, own = get_scenario(scenario).lanes, getattr(agent, "mirrored_lanes", None)
     if own is not None and own != lanes:
@@ -112,6 +150,12 @@ def check_road(agent: Any, scenario: str) -> None:
             f"'{getattr(agent, 'name', 'The agent')}' has a memory that knows a road of {known} lanes and where "
             f"episodes begin there, but {scenario} has {lanes}. Drive it on {known} lanes, or let it go on learning "
             f"with `rapid adapt AGENT --adapt.scenario {scenario} --adapt.steps 0` and steps of PPO."
+        )
+    own = getattr(agent, "shielded_lanes", None)
+    if own is not None and own != lanes:
+        raise RapidError(
+            f"'{getattr(agent, 'name', 'The agent')}' has a safety filter for roads with {own} lanes, but {scenario} "
+            f"has {lanes}. Drive it on {own} lanes."
         )
 
 

@@ -113,6 +113,11 @@ class QAgent:
         return self.network.lanes if self.has_memory else None
 
     @property
+    def shielded_lanes(self) -> int | None:
+        """For roads with how many lanes its safety filter is; None where it has none."""
+        return self.network.lanes if self.network.config.shield else None
+
+    @property
     def has_memory(self) -> bool:
         """Whether `act` and `q_values` take a state beside the observations."""
         return self.network.memory is not None

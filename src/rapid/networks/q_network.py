@@ -17,6 +17,7 @@ from rapid.networks.encoding import Encoding
 from rapid.networks.memory import Memory, Recalled
 from rapid.networks.mixture import MixtureOfPolicies
 from rapid.networks.mlp import MlpHead, MlpStack
+from rapid.safety import filter_values, margins, read_box
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, MAX_VEHICLES, MIN_VEHICLES, NUM_ACTIONS, SLOWER
 from rapid.seeding import torch_stream
 
@@ -100,7 +101,9 @@ class QNetwork(nn.Module):
     """Raw observations (B, V, F) in, Q-values (B, A) out; the policy is their argmax.
 
     With `config.mirror` the Q-values are the mean of those of the road and of its mirror image, so that left and right
-    make no difference. It has no weights, so any network may be given it by another `config`.
+    make no difference. With `config.shield` the interval filter is applied to them (:mod:`rapid.safety`): the greedy
+    action is the best of those that are safe whatever lies behind what is seen. Neither has weights, so any network may
+    be given them by another `config`.
     """
 
     mirrored_A: Tensor
@@ -153,12 +156,22 @@ class QNetwork(nn.Module):
             )
         if self.memory is not None and state_BS is not None:
             features_BVF, mask_B11V = self.encoding(self.memory.believed(obs_BVF, state_BS))
-            return cast(TokenHead, self.head)(features_BVF, mask_B11V, self.memory(obs_BVF, state_BS))
+            q_BA = cast(TokenHead, self.head)(features_BVF, mask_B11V, self.memory(obs_BVF, state_BS))
+        else:
+            q_BA = self._unfiltered(obs_BVF)
+        return self._shielded(q_BA, obs_BVF)
+
+    def _unfiltered(self, obs_BVF: Tensor) -> Tensor:
         q_BA = self.head(*self.encoding(obs_BVF))
         if not self.config.mirror:
             return q_BA
         mirrored_BA = self.head(*self.encoding(self.encoding.mirrored(obs_BVF)))
         return (q_BA + mirrored_BA.index_select(1, self.mirrored_A)) / 2
+
+    def _shielded(self, q_BA: Tensor, obs_BVF: Tensor) -> Tensor:
+        if not self.config.shield:
+            return q_BA
+        return filter_values(torch, q_BA, margins(torch, obs_BVF, self.lanes, read_box(self.config.shield, self.lanes)))
 
     @torch.no_grad()
     def explain(self, obs_BVF: Tensor, state_BS: Tensor | None = None) -> Explanation:
@@ -184,11 +197,13 @@ def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
     """Return a new network whose weights depend on `config` and `seed` alone, with every parameter trainable.
 
     Raises:
-        RapidError: N < 1, K outside 1..N, a width that the heads do not divide, vehicles outside 2..51, or a memory
-            that :func:`check_memory` refuses.
+        RapidError: N < 1, K outside 1..N, a width that the heads do not divide, vehicles outside 2..51, a memory that
+            :func:`check_memory` refuses, or a shield that :func:`rapid.safety.read_box` does not read.
     """
     if config.memory:
         check_memory(config)
+    if config.shield:
+        read_box(config.shield, lanes)
     if config.num_policies < 1 or not 1 <= config.top_k <= config.num_policies:
         raise RapidError(
             f"A network with num_policies N = {config.num_policies} and top_k K = {config.top_k} cannot be built: "

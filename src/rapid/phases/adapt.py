@@ -49,6 +49,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     lanes = get_scenario(scenario).lanes
     if network.memory is not None and network.lanes != lanes:
         network = for_lanes(network, lanes)
+    if settings.shield:
+        network.config = replace(network.config, shield=settings.shield)
     check_road(QAgent(network, distilled.name), scenario)
     evaluate, seen = learning_curve(config, scenario, name), seeing(network.config.vehicles)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))

@@ -1,0 +1,195 @@
+"""Certificates: bounds that hold for all that can be sampled and attacked, and what is concluded from them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from rapid.agents.saved import QAgent
+from rapid.agents.shielded import shielded
+from rapid.attacks import get_attack
+from rapid.certify.bounds import Bounds, perceptron
+from rapid.certify.forms import Form
+from rapid.certify.rate import Reach, certified_return, decision_rates
+from rapid.config import NetworkConfig
+from rapid.errors import RapidError
+from rapid.evaluation.rollouts import run_episodes
+from rapid.networks.encoding import feature_scale
+from rapid.networks.q_network import build_network
+from rapid.safety import Box, margins
+from rapid.scenarios import SLOWER
+from rapid.spawns import spawn_seeds
+
+SCENARIO = "lane-3-density-2"
+SMALL = {"width": 8, "heads": 2, "feedforward": 16, "layers": 1, "hidden": (16, 16), "vehicles": 6}
+NETWORKS = [
+    {"kind": "mlp"},
+    {"kind": "mlp", "input": "raw", "mask_absent": False},
+    {"kind": "mlp-mixture", "mirror": True, "input": "normalized"},
+    {"kind": "rapid"},
+    {"kind": "rapid", "input": "ego", "gate": "tanh", "num_policies": 3, "top_k": 2},
+    {"kind": "rapid", "num_policies": 3, "top_k": 1, "position": "learned"},
+    {"kind": "rapid", "mask_absent": False, "input": "normalized", "action_token": "ego"},
+    {"kind": "attentive", "layers": 2, "decoder_layers": 2, "position": "sinusoidal", "mirror": True},
+]
+
+
+def make(**settings) -> QAgent:
+    network = build_network(NetworkConfig(**{**SMALL, **settings}), 3, 0)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        if network.gate is not None and network.gate.numel():
+            torch.nn.init.normal_(network.gate)
+    return QAgent(network.requires_grad_(False), "pupil")
+
+
+def careful() -> QAgent:
+    """A pupil that brakes unless something speaks against it, and so comes to the end."""
+    agent = make(kind="mlp")
+    last = [layer for layer in agent.network.head.mlps[0] if isinstance(layer, torch.nn.Linear)][-1]
+    last.bias[SLOWER] += 0.5
+    return agent
+
+
+def offsets(samples: int, vehicles: int, seed: int = 0) -> torch.Tensor:
+    """Points of the unit box (samples, vehicles, 5), half of them corners; presence stays."""
+    points = torch.rand(samples, vehicles, 5, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    points[::2] = points[::2].sign()
+    return points * torch.tensor([0.0, 1, 1, 1, 1])
+
+
+@pytest.mark.parametrize("settings", NETWORKS, ids=str)
+def test_bounds_hold_at_every_sampled_point_of_the_box(roads, settings):
+    # Four observations, four radii and 800 points each, in eight networks: more than 10^5 points.
+    agent, scale = make(**settings), feature_scale(3) * torch.tensor([0.0, 1, 1, 1, 1])
+    obs, bounds = roads(4, absent=0.4)[:, :6], Bounds(agent.network)
+    for radius in (1e-5, 5e-4, 5e-3, 5e-2):
+        least = bounds.differences(obs - radius * scale, obs + radius * scale)
+        assert radius > 1e-4 or not least.isnan().any()
+        for index in range(4):
+            points = obs[index] + offsets(800, 6, index) * (scale * radius * 0.99999)
+            q = agent.network(points).double()
+            found = (q[:, :, None] - q[:, None]).amin(0)
+            assert bool(((found >= least[index] - 2e-5) | least[index].isnan()).all())
+
+
+@pytest.mark.parametrize("settings", NETWORKS, ids=str)
+def test_bounds_are_exact_at_a_point_and_tight_near_it(roads, settings):
+    agent, scale = make(**settings), feature_scale(3) * torch.tensor([0.0, 1, 1, 1, 1])
+    obs, bounds = roads(4)[:, :6], Bounds(agent.network)
+    q = agent.network(obs).double()
+    exact = q[:, :, None] - q[:, None]
+    assert torch.allclose(bounds.differences(obs, obs), exact, atol=2e-5)
+    # To first order the bound is the sum of the slopes: ten times less radius, ten times less room.
+    near, nearer = (exact - bounds.differences(obs - r * scale, obs + r * scale) for r in (1e-6, 1e-7))
+    rounding = 1e-5
+    assert (near - 10 * nearer).abs().max() < 0.1 * near.max() + 20 * rounding
+
+
+def test_linear_bounds_from_the_back_are_the_networks_own_slopes_where_no_relu_turns():
+    generator = torch.Generator().manual_seed(0)
+    layers = [torch.nn.Linear(3, 8).double(), torch.nn.Linear(8, 2).double()]
+    centre = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    errors = torch.eye(3, dtype=torch.float64)[:, None] * 1e-9
+    form = Form(centre, errors.expand(3, 5, 3), torch.zeros(5, 3, dtype=torch.float64))
+    wanted = torch.tensor([[1.0, -1.0]], dtype=torch.float64)
+    with torch.no_grad():
+        least = perceptron(layers, form, wanted)
+        value = layers[1](layers[0](centre).relu()) @ wanted.T
+        slope = torch.func.vmap(torch.func.jacrev(lambda x: layers[1](layers[0](x).relu()) @ wanted[0]))(centre)
+    assert torch.allclose(value[:, 0] - least[:, 0], 1e-9 * slope.abs().sum(1), rtol=1e-4, atol=1e-15)
+
+
+def test_the_filters_room_lies_below_what_a_smaller_box_says_anywhere_around(roads):
+    rng, obs = np.random.default_rng(0), roads(300).double().numpy()
+    obs[:, 1:, 1] = obs[:, :1, 1] + rng.uniform(-200, 200, (300, 14)) * obs[:, 1:, 0]
+    size = np.array([0, 4, 0.3, 1, 1])
+    for filter_box in (Box(0, 0, 0), Box(2, 0.1, 0.5), Box(20, 1.2, 8)):
+        most = margins(np, obs, 3, Box(filter_box.along - 4, filter_box.across - 0.3, filter_box.speed - 1))
+        least = margins(np, obs, 3, Box(filter_box.along + 4, filter_box.across + 0.3, filter_box.speed + 1))
+        for corner in [False, True] * 10:
+            offset = rng.uniform(-1, 1, obs.shape)
+            room = margins(np, obs + (np.sign(offset) if corner else offset) * size, 3, filter_box)
+            assert (least - 1e-6 <= room).all()
+            assert (room <= most + 1e-6).all()
+
+
+@pytest.fixture(scope="module")
+def decisions():
+    from rapid.certify.rate import decisions_of
+
+    return decisions_of(make(kind="mlp", vehicles=15), SCENARIO, spawn_seeds("tune", 8), 32)[0][:, :6]
+
+
+@pytest.mark.parametrize("shield", ["", "0", "0.005"])
+@pytest.mark.parametrize("settings", [NETWORKS[0], NETWORKS[3]], ids=str)
+def test_no_attack_brings_about_an_action_that_is_ruled_out(decisions, settings, shield):
+    agent = make(**settings) if not shield else shielded(make(**settings), shield, 3)
+    for radius in (5e-4, 5e-3):
+        may = Reach(agent, radius).actions(decisions)
+        rows = np.arange(len(decisions))
+        assert may[rows, agent.act(decisions)].all()
+        for spec in (f"pgd:steps=20,restarts=2,radius={radius}", f"pgd:loss=margin,steps=20,radius={radius}"):
+            seen = get_attack(spec, 3)(agent.network, torch.from_numpy(decisions), torch.Generator().manual_seed(0))
+            assert may[rows, agent.act(seen.numpy())].all()
+        for index in rows:
+            points = decisions[index] + (offsets(200, 6) * feature_scale(3) * radius * 0.99999).numpy()
+            assert may[index, agent.act(points)].all()
+
+
+def test_rates_fall_with_the_radius_and_the_filter_makes_every_decision_safe():
+    agent, seeds = careful(), spawn_seeds("tune", 6)
+    rates = decision_rates(agent, SCENARIO, seeds, (0.0, 5e-4, 5e-3, 0.1), 40)
+    assert [rate.decisions for rate in rates] == [40] * 4
+    unchanged = [rate.unchanged.value for rate in rates]
+    assert unchanged[0] == 1
+    assert unchanged == sorted(unchanged, reverse=True)
+    assert rates[-1].safe.value < 1
+    guarded = decision_rates(shielded(agent, "0.01", 3), SCENARIO, seeds, (5e-4, 5e-3), 40)
+    assert all(rate.safe.value == 1 for rate in guarded)
+
+
+def test_a_certified_return_is_what_is_earned_without_attack_and_less_with_a_radius():
+    seed = spawn_seeds("tune", 2)[1]
+    agent = shielded(careful(), "0.05", 3)
+    exact = certified_return(agent, SCENARIO, seed, 0.0)
+    assert exact.complete
+    assert exact.least == pytest.approx(exact.clean)
+    wide = certified_return(agent, SCENARIO, seed, 1e-3, width=8)
+    assert wide.least <= exact.least
+    attacked = run_episodes(agent, SCENARIO, [seed], "pgd:steps=20,radius=0.001")
+    assert wide.least <= attacked.return_E[0] + 1e-9
+    narrow = certified_return(agent, SCENARIO, seed, 0.1, width=1)
+    assert not narrow.complete
+    assert narrow.least < exact.least
+
+
+def test_what_cannot_be_certified_is_refused():
+    from rapid.agents.open import open_agent
+
+    agent = make(kind="mlp")
+    for radius in (-0.1, float("nan"), 0.5):
+        with pytest.raises(RapidError, match="within a radius"):
+            Reach(agent, radius)
+    with pytest.raises(RapidError, match="no network whose bounds"):
+        Reach(open_agent("slower", SCENARIO), 0.01)
+    with pytest.raises(RapidError, match="memory"):
+        Reach(make(kind="rapid", memory=True), 0.01)
+    with pytest.raises(RapidError, match="never negative"):
+        certified_return(agent, f"{SCENARIO}:progress", 0, 0.01)
+    with pytest.raises(RapidError, match="at least one decision"):
+        decision_rates(agent, SCENARIO, [1], (0.01,), 0)
+
+
+def test_who_always_brakes_is_proven_to():
+    agent = make(kind="mlp")
+    last = [layer for layer in agent.network.head.mlps[0] if isinstance(layer, torch.nn.Linear)][-1]
+    last.weight.zero_()
+    last.bias.copy_(torch.eye(5)[SLOWER])
+    (rate,) = decision_rates(agent, SCENARIO, spawn_seeds("tune", 2), (0.1,), 20)
+    assert rate.unchanged.value == rate.safe.value == 1
+    found = certified_return(agent, SCENARIO, spawn_seeds("tune", 1)[0], 0.1)
+    assert found.complete
+    assert found.least == pytest.approx(found.clean)
+    assert dataclasses.asdict(found)["seed"] == found.seed
