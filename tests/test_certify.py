@@ -1,17 +1,20 @@
 """Certificates: bounds that hold for all that can be sampled and attacked, and what is concluded from them."""
 
 import dataclasses
+import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
 
-from rapid.agents.saved import QAgent
+from rapid.agents.saved import QAgent, save_agent
 from rapid.agents.shielded import shielded
 from rapid.attacks import get_attack
 from rapid.certify.bounds import Bounds, perceptron
 from rapid.certify.forms import Form
 from rapid.certify.rate import Reach, certified_return, decision_rates
+from rapid.cli import main
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
@@ -163,6 +166,37 @@ def test_a_certified_return_is_what_is_earned_without_attack_and_less_with_a_rad
     narrow = certified_return(agent, SCENARIO, seed, 0.1, width=1)
     assert not narrow.complete
     assert narrow.least < exact.least
+
+
+def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path, capsys):
+    save_agent(tmp_path / "agent", careful().network, {"name": "pupil", "scenario": SCENARIO})
+
+    def call(*words: str) -> int:
+        with pytest.raises(SystemExit) as ended:
+            main(["certify", *words, "--out", str(tmp_path / "out")])
+        return ended.value.code
+
+    small = ("--decisions", "12", "--spawns", "3", "--returns", "1", "--radii", "0", "0.001")
+    assert call(f"shield:0.01:{tmp_path}/agent", *small) == 0
+    printed = capsys.readouterr().out
+    assert printed == (tmp_path / "out" / "certificate.txt").read_text()
+    assert "0.2 m, 0.012 m, 0.08 m/s" in printed
+    assert "return under every attack within 0.001, 1 episodes: at least" in printed
+    found = json.loads((tmp_path / "out" / "certificate.json").read_text())
+    assert found["shield"] == "0.01"
+    assert [rate["safe"]["value"] for rate in found["decisions"]] == [1, 1]
+    assert found["decisions"][0]["unchanged"]["value"] == 1
+    assert found["returns"][0]["least"] == pytest.approx(found["returns"][0]["clean"])
+    shutil.rmtree(tmp_path / "out")
+    for words, said in (
+        ((str(tmp_path / "agent"), "--radii", "0.001", "-1"), "within a radius"),
+        ((str(tmp_path / "agent"), "--spawns", "2", "--returns", "3"), "Ask for more"),
+        (("slower",), "no agent"),
+        ((str(tmp_path / "agent"), "--scenario", f"{SCENARIO}:progress", "--returns", "1"), "never negative"),
+    ):
+        assert call(*words) == 2
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_certified_is_refused():

@@ -27,6 +27,7 @@ VERBS: dict[str, str] = {
     "adversary": "train an adversary against one agent, to be named among attacks",
     "evaluate": "drive policies and scripted drivers over fixed spawns, clean and attacked",
     "teach-bench": "compare teachers, models and prompt styles on the same spawns",
+    "certify": "prove for how many decisions no attack within a radius changes anything",
     "export": "write an agent as ONNX, check it against the original, time it",
     "import": "make an agent of a model that stable-baselines3 saved; nothing is unpickled",
     "report": "write the page of a run again",

@@ -246,6 +246,30 @@ class TeachBench:
 
 
 @dataclass(frozen=True)
+class Certify:
+    """Prove what no attack within a radius can do: change a decision, make it unsafe, lower the return further.
+
+    Sound bounds through the network as it was trained, not an attack: what is not proven need not be false. For agents
+    with a network and no memory; attacks leave presence alone.
+    """
+
+    agent: Annotated[Positional[str], arg(metavar="AGENT")]
+    """Directory of the agent, perhaps behind shield:BOX:."""
+    radii: tuple[float, ...] = (0.0005, 0.001, 0.005)
+    """Radii of the attacks (L-infinity, features scaled to +-1: 0.0005 is 0.1 m along the road and 0.04 m/s)."""
+    decisions: Positive = 100
+    """Decisions that are certified for each radius. A perceptron's take milliseconds, a mixture's about a second."""
+    spawns: Positive = 20
+    """Test spawns, on the way through which the agent decides."""
+    returns: Count = 0
+    """Of how many of them the return is bounded too, by the tree of all actions that an attack may bring about."""
+    scenario: str = ""
+    """Where it drives; by default where it was trained."""
+    out: str = "certificate"
+    """Directory of the table and the numbers."""
+
+
+@dataclass(frozen=True)
 class Export:
     """Write an agent as ONNX, compare the two on real observations, and time a decision."""
 

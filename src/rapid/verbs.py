@@ -22,6 +22,7 @@ from rapid.options import (
     Adapt,
     Adversary,
     Agents,
+    Certify,
     Collect,
     Distill,
     Doctor,
@@ -232,6 +233,18 @@ def _teach_bench(options: TeachBench, config: Config) -> int:
     return 0
 
 
+def _certify(options: Certify, config: Config) -> int:
+    from rapid.agents.open import check_road, network_agent
+    from rapid.certify.table import certify
+
+    agent = network_agent(options.agent)
+    check_road(agent, config.scenario)
+    out = Path(options.out)
+    counts = options.decisions, options.spawns, options.returns
+    print(certify(agent, config.scenario, options.radii, *counts, out), end="")
+    return 0
+
+
 def _export(options: Export, config: Config) -> int:
     import torch
 
@@ -422,6 +435,7 @@ VERBS: dict[str, tuple[type[Any], Callable[[Any, Config], int], str]] = {
     "evaluate": (Evaluate, _evaluate, "rapid.phases.measure"),
     "adversary": (Adversary, _adversary, "rapid.phases.adversary"),
     "teach-bench": (TeachBench, _teach_bench, "rapid.teach_bench"),
+    "certify": (Certify, _certify, "rapid.certify.table"),
     "export": (Export, _export, "rapid.agents.onnx"),
     "import": (Import, _import, "rapid.agents.sb3"),
     "report": (Report, _report, "rapid.phases.page"),

@@ -167,6 +167,19 @@ class CertifiedReturn:
     """Whether it is proven that no attack brings about a crash."""
 
 
+def check_reward(scenario: str) -> None:
+    """Check that what lies beyond a tree can be counted as nothing.
+
+    Raises:
+        RapidError: the reward can be negative.
+    """
+    if get_scenario(scenario).reward != "normalized":
+        raise RapidError(
+            "A certified return needs a reward that is never negative, so that what lies beyond the tree counts as "
+            "nothing. Choose a scenario without :progress."
+        )
+
+
 def certified_return(agent: QAgent, scenario: str, seed: int, radius: float, width: int = 256) -> CertifiedReturn:
     """Follow every action that an attack may bring about, step by step, in copies of the true world (CROP's tree).
 
@@ -177,11 +190,7 @@ def certified_return(agent: QAgent, scenario: str, seed: int, radius: float, wid
         RapidError: an agent or a radius that :class:`Reach` refuses, or a reward that can be negative.
     """
     reach = Reach(agent, radius)
-    if get_scenario(scenario).reward != "normalized":
-        raise RapidError(
-            "A certified return needs a reward that is never negative, so that what lies beyond the tree counts as "
-            "nothing. Choose a scenario without :progress."
-        )
+    check_reward(scenario)
     clean = float(run_episodes(agent, scenario, [seed]).return_E[0])
     env: Any = make_vec(scenario, 1, config=seeing(agent.vehicles), autoreset=False)
     obs_WVF, _ = env.reset(seed=[seed])
