@@ -207,3 +207,18 @@ def test_an_injected_script_does_not_run(opened: Open, chromium: Any, live: Live
         button(shown.page, "Play").wait_for()
         assert shown.page.evaluate("window.caught") is None
         assert any("Content Security Policy" in trouble for trouble in shown.troubles)
+
+
+def test_a_connection_that_comes_back_goes_on_where_it_was(opened: Open, live: LivePage) -> None:
+    shown = opened(left="rule")
+    page = shown.page
+    steps(page, 2)
+    before = page.locator(".facts").first.inner_text()
+    for connection in live._server.connections:
+        connection.close()
+    until(page, "document.querySelector('.status').textContent.includes('was lost')", 60)
+    until(page, "document.querySelector('.status').textContent === ''", 60)
+    until(page, "document.querySelector('.at').textContent === '2.0 s'", 60)
+    assert page.locator(".facts").first.inner_text() == before
+    steps(page, 1)
+    shown.troubles = [trouble for trouble in shown.troubles if "WebSocket" not in trouble]

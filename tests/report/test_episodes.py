@@ -8,11 +8,14 @@ import pytest
 from samples import SCENARIO, recording
 
 from rapid.agents.saved import QAgent
+from rapid.attacks.spec import parse_attack
 from rapid.config import NetworkConfig
 from rapid.evaluation.recording import Recording, explained_by, follow, load_recordings, save_recordings
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.q_network import build_network
 from rapid.pages.episodes import moving_picture, side_by_side
+from rapid.phases.measure import crashes_of
+from rapid.presets import preset
 
 
 @pytest.fixture(scope="module")
@@ -88,3 +91,16 @@ def test_undisturbed_episodes_come_first_and_empty_ones_are_left_out(attacked: R
     empty = replace(recording(), action_T=np.zeros(0, np.int64))
     drawn = side_by_side([attacked, empty, recording()])
     assert [episode["attack"] for episode in drawn] == ["none", "uniform"]
+
+
+def test_a_run_keeps_the_first_crashes_of_learned_agents_as_they_were(agent: QAgent) -> None:
+    seeds, spec = range(900_000, 900_006), parse_attack("uniform")
+    measured = run_episodes(agent, "lane-5-density-3", seeds, "uniform")
+    assert measured.crashed_E.any()
+    kept = crashes_of(replace(preset(), seed=0), agent, [(spec, measured)])
+    assert [recording.seed for recording in kept] == measured.seed_E[measured.crashed_E][:1].tolist()
+    first = int(measured.crashed_E.argmax())
+    assert len(kept[0].action_T) == measured.length_E[first]
+    assert kept[0].reward_T.sum() == pytest.approx(measured.return_E[first])
+    assert kept[0].attack == "uniform"
+    assert crashes_of(preset(), agent, [(spec, replace(measured, kind="floor"))]) == []

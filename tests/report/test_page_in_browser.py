@@ -1,5 +1,6 @@
 """The page in a real browser: what a reader can do with it, and what it must never do."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -257,3 +258,87 @@ def test_a_page_without_episodes_has_no_player(opened: Open) -> None:
     page = opened(replace(full(), recordings=[])).page
     assert page.locator(".player").count() == 0
     assert "No episode was recorded." in page.locator("#watch").inner_text()
+
+
+def crashed(seed: int = 900_002) -> Recording:
+    """An attacked episode that ends in a crash, in which the one car was seen ten metres farther on."""
+    one = replace(ride(6, "RAPID", seed), crashed=True, attack="pgd")
+    seen = one.obs_TVF[:-1].copy()
+    seen[:, 1, 1] += 10
+    return replace(one, seen_TVF=seen, weights_TVN=np.full((6, 15, 2), 0.5, np.float32))
+
+
+def test_the_gallery_plays_a_crash(opened: Open) -> None:
+    page = opened(run(ride(3), crashed())).page
+    page.get_by_role("button", name=re.compile("RAPID under pgd, spawn 900002")).click()
+    assert page.get_by_label("episode", exact=True).input_value() == "1"
+    until(page, "document.querySelector('.score').textContent.startsWith('crashed after 6 s')", 20)
+    assert page.get_by_label("what it is made to see").is_checked()
+    page.locator(".player").first.focus()
+    page.keyboard.press("c")
+    assert 3 <= clock(page) < 6
+
+
+def test_two_episodes_of_one_spawn_stand_side_by_side_on_one_clock(opened: Open) -> None:
+    page = opened(run(ride(3), ride(5, "other"))).page
+    assert page.get_by_label("beside it").input_value() == "1"
+    assert page.locator(".score").count() == 2
+    page.get_by_label("time, seconds").fill("4")
+    assert page.locator(".score").first.inner_text() == "arrived after 3 s, return 1.50"
+    assert page.locator(".score").nth(1).inner_text() == ""
+    page.get_by_label("beside it").select_option("")
+    assert not page.locator(".pane").nth(1).locator("canvas").is_visible()
+
+
+def test_a_link_leads_to_its_moment(opened: Open) -> None:
+    page = opened(run(ride(3), crashed())).page
+    page.evaluate("() => { location.hash = '#moment=1,0,2.5'; }")
+    until(page, "document.querySelector('.scrub').value === '2.5'")
+    assert page.get_by_label("beside it").input_value() == "0"
+    # One that leads nowhere changes nothing.
+    page.evaluate("() => { location.hash = '#moment=99,0,1'; }")
+    assert clock(page) == 2.5
+
+
+def test_routing_over_time_has_a_line_for_each_car_and_a_column_for_each_decision(opened: Open) -> None:
+    page = opened(run(crashed())).page
+    page.get_by_text("Which policy decides about which car, over time").first.click()
+    until(page, "document.querySelectorAll('.heat-map rect').length === 2 * 6 + 1")
+
+
+def test_on_paper_there_is_nothing_to_press(opened: Open) -> None:
+    page = opened(run(crashed())).page
+    page.emulate_media(media="print")
+    for hidden in (".play", ".scrub", ".strip", ".sharing"):
+        assert not page.locator(hidden).first.is_visible()
+    assert page.locator(".player canvas").first.is_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_that_can_be_used_has_a_name_and_all_text_can_be_read(opened: Open, scheme: str) -> None:
+    page = opened(run(crashed(), ride(3)), color_scheme=scheme).page
+    nameless = page.evaluate(
+        """() => [...document.querySelectorAll("button, select, input, canvas, [tabindex='0']")]
+          .filter((node) => !node.closest("[aria-hidden]") && !node.ariaLabel && !node.textContent.trim()
+            && !node.labels?.length && !node.title).map((node) => node.outerHTML.slice(0, 90))"""
+    )
+    assert nameless == []
+    # WCAG 2.2, 1.4.3: text stands out from what is behind it by 4.5 to 1.
+    ratios = page.evaluate(
+        """() => {
+          const style = getComputedStyle(document.documentElement);
+          const light = (name) => {
+            const parts = [1, 3, 5].map((i) => parseInt(style.getPropertyValue(name).trim().slice(i, i + 2), 16) / 255)
+              .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4));
+            return 0.2126 * parts[0] + 0.7152 * parts[1] + 0.0722 * parts[2];
+          };
+          const pairs = [["--ink", "--card"], ["--soft", "--card"], ["--soft", "--paper"], ["--ink", "--paper"],
+            ["--crash", "--card"], ["--ghost", "--card"], ["--accent", "--card"], ["--paper", "--accent"],
+            ["--on-car", "--car"], ["--on-car", "--one"], ["--soft", "--grass"]];
+          return Object.fromEntries(pairs.map(([a, b]) => {
+            const [x, y] = [light(a), light(b)].sort((p, q) => q - p);
+            return [`${a} on ${b}`, (x + 0.05) / (y + 0.05)];
+          }));
+        }"""
+    )
+    assert {pair: round(ratio, 2) for pair, ratio in ratios.items() if ratio < 4.5} == {}

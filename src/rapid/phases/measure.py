@@ -170,7 +170,7 @@ def measure(
             driven = _drive(config, scenario, spec, agent, out)
             episodes = [of for _, of in driven]
             recordings = [recording for of in episodes for recording in of.recordings[:RECORDED]]
-            recordings += _crashes(config, agent, driven)
+            recordings += crashes_of(config, agent, driven)
             if recordings:
                 save_recordings(
                     part.with_suffix(".recordings.json"), [explained_by(agent, each) for each in recordings]
@@ -253,7 +253,7 @@ def _drive_under(job: tuple[Config, str, str, Any, AttackSpec, int], report: Cal
     )
 
 
-def _crashes(config: Config, agent: Any, driven: Sequence[tuple[AttackSpec, Episodes]]) -> list[Recording]:
+def crashes_of(config: Config, agent: Any, driven: Sequence[tuple[AttackSpec, Episodes]]) -> list[Recording]:
     """Drive the first crashes of a learned agent again, under each attack, to keep what happened step by step."""
     found: list[Recording] = []
     for attack, of in driven:
