@@ -20,7 +20,7 @@ import torch
 import rapid
 from rapid.agents.saved import QAgent
 from rapid.config import Config, PpoConfig
-from rapid.config_io import apply_overrides
+from rapid.config_io import apply_overrides, validate
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
@@ -32,7 +32,7 @@ from rapid.phases.adapt import adapt_agent
 from rapid.phases.distill import distill_agent, distill_seeds
 from rapid.phases.measure import compare
 from rapid.phases.page import report_again
-from rapid.presets import offline_baseline, preset
+from rapid.presets import offline_baseline, online_baseline, preset
 from rapid.run import run
 from rapid.runs import STEPS
 from rapid.scenarios import SLOWER
@@ -77,14 +77,17 @@ def artefacts(directory: Path) -> dict[str, bytes]:
 
 
 def test_a_run_leaves_agents_rows_and_a_page(finished: Path):
-    for agent in ("distill/rapid", "distill/offline-dqn", "distill/cloning", "adapt/rapid"):
+    for agent in ("distill/rapid", "distill/offline-dqn", "distill/cloning", "adapt/rapid", "adapt/online-dqn"):
         assert rapid.load_agent(finished / agent / "agent").name
     rows = load_rows(finished / "evaluate" / "episodes.parquet")
     measured = {row.agent for row in rows}
     assert {"slower", "idle", "random", "rule", "planner", "behaviour cloning", "offline DQN", "RAPID"} <= measured
+    assert {"immune", "blind", "online DQN", "online PPO"} <= measured
     assert {row.attack for row in rows if row.agent == "RAPID"} == {"none", "uniform", "pgd"}
     page = (finished / "report.html").read_text()
     assert "always-slower" in page
+    assert "Ahead of RAPID in" in page
+    assert "Ahead of RAPID in" in (finished / "evaluate/summary.txt").read_text()
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert (finished / "figures" / "results.png").stat().st_size > 10_000
 
@@ -112,6 +115,32 @@ def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, ki
     with pytest.raises(RapidError, match="Choose another --out"):
         distill_seeds(other, finished / "mix", tmp_path / "all", (1, 2))
     assert [(home / "agent" / "weights.safetensors").read_bytes() for home in homes] == before
+
+
+def test_online_baselines_drive_as_much_as_phase_3_and_know_nothing_at_first(config: Config, finished: Path):
+    steps = config.adapt.steps + config.adapt.ppo.steps
+    ours = load_metrics(finished / "adapt/rapid/ppo")[-1]["step"]
+    assert ours == load_metrics(finished / "adapt/online-dqn")[-1]["step"] == steps
+    # Of PPO whole rollouts.
+    per_rollout = config.adapt.ppo.num_envs * config.adapt.ppo.rollout
+    assert load_metrics(finished / "adapt/online-ppo/ppo")[-1]["step"] == steps // per_rollout * per_rollout
+    for name in ("online-dqn", "online-ppo"):
+        agent = rapid.load_agent(finished / "adapt" / name / "agent")
+        assert agent.network.config.kind == "mlp"
+        assert rapid.load_agent(finished / "adapt" / name / "new").metadata["phase"] == "new"
+    assert "online PPO" in (finished / "report.html").read_text()
+
+
+@pytest.mark.parametrize("plan", ["bold", "ppo", "robust"])
+def test_online_baselines_of_every_plan_can_be_trained(plan: str):
+    for change in ({}, {"vehicles": 31}, {"mirror": True, "memory": False}):
+        config = preset("strong", "tiny", plan)
+        config = replace(config, adapt=replace(config.adapt, **change))
+        for algorithm in ("dqn", "ppo"):
+            other = online_baseline(config, algorithm)
+            validate(other)
+            assert other.network.vehicles == (config.adapt.vehicles or 15)
+            assert (other.adapt.steps > 0, other.adapt.ppo.steps > 0) == (algorithm == "dqn", algorithm == "ppo")
 
 
 def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(finished: Path):

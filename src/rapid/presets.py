@@ -15,6 +15,7 @@ from rapid.config import (
     RECIPES,
     SCALES,
     AdaptConfig,
+    AdversaryConfig,
     Config,
     DistillConfig,
     LossConfig,
@@ -294,13 +295,14 @@ def offline_baseline(config: Config, algorithm: OfflineBaseline) -> Config:
 MLP_DISCOUNT = 0.93
 """Longest discount of the MLPs from scratch: chosen of 0.9, 0.93 and 0.95 by one training each (docs/log/)."""
 
-OnlineBaseline = Literal["dqn", "ddqn", "munchausen"]
+OnlineBaseline = Literal["dqn", "ddqn", "munchausen", "ppo"]
 
 
 def online_baseline(config: Config, algorithm: OnlineBaseline) -> Config:
     """Return the settings of an MLP that learns online from new weights, with as many steps as RAPID's phase 3.
 
-    In the recipe `paper` the DQN has the step size that the paper prints for it.
+    `munchausen` learns by both parts of phase 3 as RAPID does, `dqn` and `ddqn` by Q-learning alone, `ppo` by PPO
+    alone. In the recipe `paper` the DQN has the step size that the paper prints for it.
     """
     adapt = config.adapt
     discount = adapt.loss.discount if config.recipe == "paper" else min(adapt.loss.discount, MLP_DISCOUNT)
@@ -314,16 +316,25 @@ def online_baseline(config: Config, algorithm: OnlineBaseline) -> Config:
     rate = 5e-4
     if config.recipe == "paper" and algorithm == "dqn":
         rate = paper_numbers()["hyperparameters"]["dqn"]["learning_rate"]
-    return replace(
-        config,
-        network=replace(config.network, kind="mlp"),
-        adapt=replace(
-            adapt,
-            train="scratch",
-            exploration_start=1.0,
-            exploration_end=0.05,
-            offline_share=0.0,
-            loss=loss,
-            optimizer=replace(adapt.optimizer, learning_rate=rate),
-        ),
+    steps, ppo = adapt.steps + adapt.ppo.steps, adapt.ppo
+    # An MLP has weights for every row and no tokens: it sees from the start as far as RAPID in the end, and no memory.
+    network = replace(config.network, kind="mlp", memory=False, vehicles=adapt.vehicles or config.network.vehicles)
+    adapt = replace(
+        adapt,
+        train="scratch",
+        vehicles=0,
+        memory=False,
+        exploration_start=1.0,
+        exploration_end=0.05,
+        offline_share=0.0,
+        loss=loss,
+        optimizer=replace(adapt.optimizer, learning_rate=rate),
     )
+    if algorithm in ("dqn", "ddqn"):
+        # Q-learning is not attacked.
+        adapt = replace(adapt, steps=steps, ppo=replace(ppo, steps=0), adversary=AdversaryConfig())
+    elif algorithm == "ppo":
+        # Two rollouts at least: its policy changes between them.
+        steps = max(steps, 2 * ppo.num_envs * ppo.rollout)
+        adapt = replace(adapt, steps=0, ppo=replace(ppo, steps=steps, critic_steps=0), train="all")
+    return replace(config, network=network, adapt=adapt)

@@ -15,13 +15,13 @@ from rapid.data.shipped import SHIPPED
 from rapid.errors import RapidError, did_you_mean
 from rapid.locks import exclusive
 from rapid.networks.q_network import check_widening
-from rapid.phases.adapt import adapt_agent
+from rapid.phases.adapt import ONLINE, adapt_agent, learn_online
 from rapid.phases.checks import check
 from rapid.phases.data import collect_transitions, data_folders, given_data, mix_datasets
 from rapid.phases.distill import distill_agent
 from rapid.phases.measure import FLOORS, PLANNER, TEACHER, floors_under_attack, measure, why_no_teacher
 from rapid.phases.page import write_run_report
-from rapid.presets import offline_baseline
+from rapid.presets import offline_baseline, online_baseline
 from rapid.progress import format_seconds
 from rapid.runs import STEPS, RunDirectory, commit
 from rapid.scenarios import get_scenario
@@ -169,6 +169,9 @@ def _distill(config: Config, home: RunDirectory) -> dict[str, Any]:
 
 def _adapt(config: Config, home: RunDirectory) -> dict[str, Any]:
     adapt_agent(config, home.path / "distill" / "rapid" / "agent", home.path / "mix", home.path / "adapt" / "rapid")
+    # The two baselines that drive as much but know nothing at first: what distilling adds is the difference to them.
+    for folder, (algorithm, name) in ONLINE.items():
+        learn_online(online_baseline(config, algorithm), home.path / "adapt" / folder, name)
     return {}
 
 
@@ -185,6 +188,7 @@ def _evaluate(config: Config, home: RunDirectory) -> dict[str, Any]:
     specs += [str(home.path / "distill" / name / "agent") for name in ("cloning", "offline-dqn", "rapid")]
     specs.append(str(home.path / "adapt" / "rapid" / "agent"))
     specs += [spec for spec in floors_under_attack(config.adapt.scenario or config.scenario) if spec not in FLOORS]
+    specs += [str(home.path / "adapt" / folder / "agent") for folder in ONLINE]
     rows = measure(config, config.adapt.scenario or config.scenario, specs, home.path / "evaluate")
     return {"episodes": len(rows), **({"note": note} if note else {})}
 

@@ -30,6 +30,9 @@ NUM_ACTIONS = len(ACTIONS)
 TARGET_SPEEDS = tuple(4.0 * i for i in range(9))
 """``linspace(0, 32, 9)`` m/s, the speeds that FASTER and SLOWER step through."""
 
+PROGRESS_SPEED, PROGRESS_CRASH = 32, -5.0
+"""The reward `progress` of a step is the speed along the road over so many m/s; a crash costs the other."""
+
 PAPER_SCENARIOS = ("lane-3-density-2", "lane-4-density-2.5", "lane-5-density-3")
 
 _NAME = re.compile(r"lane-(\d+)-density-(\d+(?:\.\d+)?)(-fast)?(?::(normalized|progress))?(:clock)?")
@@ -82,10 +85,10 @@ class Scenario:
         if self.reward == "progress":
             # The paper's reward pays a parked car 0.67 a step; here only distance and not crashing count.
             config |= {
-                "reward_speed_range": [0, 32],
+                "reward_speed_range": [0, PROGRESS_SPEED],
                 "high_speed_reward": 1.0,
                 "right_lane_reward": 0.0,
-                "collision_reward": -5.0,
+                "collision_reward": PROGRESS_CRASH,
                 "normalize_reward": False,
             }
         return config

@@ -42,6 +42,10 @@ SHORT: dict[str, tuple[str, ...]] = {
         *("out", "dataset", "scenario", "steps", "ppo.steps", "train", "loss.discount", "optimizer.learning-rate"),
         *("offline-share", "adversary.gradient-share", "recipe", "scale", "plan", "seed", "device", "config"),
     ),
+    "play": (
+        *("scenario", "spawn", "moment", "port", "browser", "seed", "teacher.backend", "teacher.model"),
+        *("teacher.style", "teacher.base-url", "teacher.api-key-env"),
+    ),
 }
 """Of the verbs with many options those that matter most, in the order in which they are told."""
 

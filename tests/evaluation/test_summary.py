@@ -4,9 +4,13 @@ import math
 import re
 from dataclasses import replace
 
+import pytest
 from test_metrics import ROW
 
-from rapid.evaluation.summary import NOT_APPLICABLE, label_of, summarize, summary_text
+from rapid.agents.open import open_agent
+from rapid.evaluation.metrics import EpisodeRow, Kind
+from rapid.evaluation.rollouts import run_episodes
+from rapid.evaluation.summary import NOT_APPLICABLE, ahead_of, label_of, summarize, summary_text
 
 
 def rows_of(agent: str, attack: str = "none", count: int = 6, **changes):
@@ -74,3 +78,48 @@ def test_who_has_no_values_is_not_attacked_by_search_and_that_is_said() -> None:
     by_agent = {row.agent: row for row in summarize([*floor, *net, *searched])}
     assert {cell.missing for cell in by_agent["slower"].attacks.values()} == {NOT_APPLICABLE}
     assert {cell.missing for cell in by_agent["net"].attacks.values()} == {""}
+
+
+def test_who_is_ahead_of_the_lead_is_said_plainly() -> None:
+    def driven(agent: str, returns: list[float], attack: str = "none", kind: Kind = "learned") -> list[EpisodeRow]:
+        (row, *_) = rows_of(agent, kind=kind)
+        pairs = enumerate(returns)
+        return [replace(row, seed=seed, episode_return=value, attack=attack) for seed, value in pairs]
+
+    spread = [float(number % 3) for number in range(12)]
+    rows = [
+        *driven("RAPID", [20 + value for value in spread]),
+        *driven("slower", [21 + value for value in spread], kind="floor"),
+        *driven("online DQN", [20 + value + (-1) ** number * 5 + 0.1 for number, value in enumerate(spread)]),
+        *driven("offline DQN", [10.0] * 12),
+        *driven("smollm2-135m", [30.0] * 12, kind="teacher"),
+        *driven("RAPID", [10 + value for value in spread], "pgd"),
+        *driven("offline DQN", [15 + value for value in spread], "pgd"),
+    ]
+    clean, attacked = ahead_of(rows)
+    first, second = clean.removesuffix(".").split("; ")
+    assert first == "Ahead of RAPID in lane-3-density-2, without attack: always-slower by 1.00 [1.00, 1.00]"
+    assert re.fullmatch(r"online DQN by 0\.10 \[-.*\], which may be chance", second)
+    # Who does not look drives under an attack as without.
+    assert attacked.startswith(
+        "Ahead of RAPID in lane-3-density-2, under pgd: always-slower by 11.00 [11.00, 11.00]; off"
+    )
+    assert all(line in summary_text(rows) for line in (clean, attacked))
+    assert ahead_of(driven("RAPID", [20.0] * 3) + driven("idle", [19.0] * 3, kind="floor")) == [
+        "Ahead of RAPID in lane-3-density-2, without attack: no floor and no baseline."
+    ]
+    assert ahead_of(driven("slower", spread)) == []
+
+
+@pytest.mark.parametrize("driver", ["rule", "faster", "random"])
+def test_progress_beside_the_papers_reward_is_that_reward_of_the_same_driving(driver: str) -> None:
+    seeds = list(range(900_000, 900_008))
+    ours, theirs = (
+        run_episodes(open_agent(driver, name), name, seeds).rows()
+        for name in ("lane-3-density-2", "lane-3-density-2:progress")
+    )
+    for row, other in zip(ours, theirs, strict=True):
+        assert (row.length, row.crashed) == (other.length, other.crashed)
+        assert row.progress_return == pytest.approx(other.episode_return, abs=0.05)
+    assert "progress" in summary_text(ours, resamples=50).splitlines()[1]
+    assert "progress" not in summary_text(theirs, resamples=50).splitlines()[1]

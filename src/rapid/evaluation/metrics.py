@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
 from rapid.files import atomic_path
-from rapid.scenarios import ACTIONS
+from rapid.scenarios import ACTIONS, PROGRESS_CRASH, PROGRESS_SPEED
 
 Kind = Literal["floor", "teacher", "planner", "learned"]
 """What kind of agent: needs no learning, a teacher, search in the simulator, or learned."""
@@ -61,6 +61,15 @@ class EpisodeRow:
     """Whether the agent has a network that a gradient attack can use."""
     gradient_attack: bool = False
     """Whether the attack needs the agent's gradient."""
+
+    @property
+    def progress_return(self) -> float:
+        """The return of the same driving under the reward `progress`, to a hundredth or so.
+
+        That reward is the speed along the road over 32 m/s, and -5 for a crash; while changing lanes the mean speed has
+        a little in it that is not along the road.
+        """
+        return self.length * self.mean_speed / PROGRESS_SPEED + PROGRESS_CRASH * self.crashed
 
 
 _SHARES = tuple(f"share_{action.lower()}" for action in ACTIONS)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rapid.evaluation.metrics import EpisodeRow, Kind, column
-from rapid.evaluation.statistics import ENOUGH_SEEDS, RESAMPLES, Estimate, estimate
-from rapid.scenarios import ACTIONS
+from rapid.evaluation.statistics import ENOUGH_SEEDS, RESAMPLES, Estimate, estimate, paired_difference
+from rapid.scenarios import ACTIONS, get_scenario
 
 KINDS: dict[Kind, str] = {
     "floor": "needs no learning",
@@ -45,6 +45,7 @@ WIDE = 6
 """Attacks that a table of plain text holds side by side; more of them stand one below the other."""
 METRICS: tuple[str, ...] = (
     "episode_return",
+    "progress_return",
     "crashed",
     "mean_speed",
     "distance",
@@ -203,8 +204,56 @@ def summary_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
             blocks.append(aligned(lines if len(names) <= WIDE else list(zip(*lines, strict=True))))
     if any(cell.missing == NOT_APPLICABLE for row in summaries for cell in row.attacks.values()):
         blocks.append(f"{NOT_APPLICABLE}: {NOT_APPLICABLE_WHY}")
+    blocks += ["\n".join(lines) for lines in [ahead_of(rows, resamples=resamples)] if lines]
     blocks.append(units(summaries))
     return "\n\n".join(blocks)
+
+
+LEAD = "RAPID"
+"""The agent that a run is about."""
+_UNMOVED = ("slower", "idle", "faster", "blind")
+"""Floors that do not look: they drive under every attack as without one."""
+
+
+def ahead_of(rows: Sequence[EpisodeRow], lead: str = LEAD, resamples: int = RESAMPLES) -> list[str]:
+    """Return a sentence for each scenario and attack under which `lead` drove: which floors and baselines are ahead.
+
+    Ahead is who has the higher mean return on the spawns that both drove; whether the 95 % interval of that difference
+    holds zero is said too. Teacher and planners are no baselines: they may take seconds for a decision.
+    """
+    groups: dict[tuple[str, str], dict[str, list[EpisodeRow]]] = {}
+    for row in rows:
+        if row.kind in ("floor", "learned"):
+            groups.setdefault((row.scenario, row.attack), {}).setdefault(row.agent, []).append(row)
+    lines: list[str] = []
+    for (scenario, attack), agents in groups.items():
+        clean = {name: of for name, of in groups.get((scenario, CLEAN), {}).items() if name in _UNMOVED}
+        agents = clean | agents
+        others = [(name, of) for name, of in agents.items() if name != lead]
+        if lead not in agents or not others:
+            continue
+        found = [text for name, of in others if (text := _lead_over(of, agents[lead], label_of(name), resamples))]
+        where = f"{scenario}, {'without attack' if attack == CLEAN else f'under {attack}'}"
+        told = "; ".join(found) or "no floor and no baseline"
+        lines.append(f"Ahead of {lead} in {where}: {told}.")
+    return lines
+
+
+def _lead_over(of: Sequence[EpisodeRow], lead: Sequence[EpisodeRow], label: str, resamples: int) -> str:
+    theirs, ours = column(of, "episode_return"), column(lead, "episode_return")
+    gap = paired_difference(
+        theirs,
+        [row.seed for row in of],
+        ours,
+        [row.seed for row in lead],
+        [row.training_seed for row in of],
+        [row.training_seed for row in lead],
+        resamples=resamples,
+    )
+    if not gap.value > 0:
+        return ""
+    doubt = "" if gap.low > 0 else ", which may be chance"
+    return f"{label} by {with_interval(gap, 2)}{doubt}"
 
 
 def _attack_texts(row: SummaryRow) -> list[str]:
@@ -216,7 +265,20 @@ def _attack_texts(row: SummaryRow) -> list[str]:
 
 def _clean_cells(rows: Sequence[SummaryRow]) -> list[list[str]]:
     short = "/".join(name.removeprefix("LANE_")[0].lower() for name in ACTIONS)
-    lines = [["agent", "return", "IQM", "crash %", "speed m/s", "distance m", f"actions % {short}"]]
+    # Under the reward `progress` it is what the return is.
+    other = get_scenario(rows[0].scenario).reward != "progress"
+    lines = [
+        [
+            "agent",
+            "return",
+            "IQM",
+            *(["progress"] if other else []),
+            "crash %",
+            "speed m/s",
+            "distance m",
+            f"actions % {short}",
+        ]
+    ]
     for row in rows:
         of = row.metrics
         lines.append(
@@ -224,6 +286,7 @@ def _clean_cells(rows: Sequence[SummaryRow]) -> list[list[str]]:
                 row.label,
                 with_interval(of["episode_return"]),
                 number(of["iqm"].value),
+                *([number(of["progress_return"].value)] if other else []),
                 with_interval(of["crashed"], 0, 100),
                 with_interval(of["mean_speed"]),
                 number(of["distance"].value, 0),

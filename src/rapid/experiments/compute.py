@@ -12,7 +12,7 @@ import torch
 
 import rapid
 from rapid.agents.open import open_agent
-from rapid.agents.saved import load_agent, remembers, save_agent
+from rapid.agents.saved import load_agent, remembers
 from rapid.config import Config
 from rapid.data.dataset import load_dataset, mix, save_dataset
 from rapid.data.relabel import relabel
@@ -39,8 +39,7 @@ from rapid.experiments.cells import (
 )
 from rapid.experiments.store import FACTS, ROWS
 from rapid.files import write_json
-from rapid.networks.q_network import build_network
-from rapid.phases.adapt import adapt_agent
+from rapid.phases.adapt import adapt_agent, new_agent
 from rapid.phases.data import collect_transitions
 from rapid.phases.distill import distill_agent
 from rapid.runs import commit
@@ -74,9 +73,7 @@ def compute(cell: Cell, place: Path, given: Mapping[str, Path]) -> None:
             )  # the stream that `rapid run` draws from
             save_dataset(mixed, place / "data")
         case Fresh():
-            seed = stream_seed(cell.seed, "network")
-            network = build_network(cell.network, get_scenario(cell.scenario).lanes, seed)
-            save_agent(place / "agent", network, {"name": "new weights", "scenario": cell.scenario, "seed": cell.seed})
+            new_agent(cell.network, cell.scenario, cell.seed, place / "agent")
         case Distill():
             distill_agent(_settings(cell), given[key(cell.data)] / "data", place)
         case Adapt():

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 from rapid.config import Config, MixConfig, TeacherConfig
 from rapid.experiments.cells import Adapt, Data, Distill, Driver, Fresh, Mix, Relabel, Shipped
-from rapid.presets import offline_baseline, online_baseline, preset
+from rapid.presets import OnlineBaseline, offline_baseline, online_baseline, preset
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
 Dataset = Literal["random", "llm", "mixed"]
@@ -170,22 +170,11 @@ def mixture_of_actions(setting: Setting, data: Mix) -> Adapt:
     return Adapt(start, online, setting.scenario, base.adapt, setting.seed, setting.effort.curve_spawns)
 
 
-def from_scratch(setting: Setting, algorithm: Literal["dqn", "ddqn", "munchausen"], plan: str = "") -> Adapt:
+def from_scratch(setting: Setting, algorithm: OnlineBaseline, plan: str = "") -> Adapt:
     """Return an MLP that learns online alone, with as many steps as RAPID's phase 3."""
     config = online_baseline(setting.config(plan=plan), algorithm)
     fresh = Fresh(setting.scenario, config.network, setting.seed)
     return Adapt(fresh, None, setting.scenario, config.adapt, setting.seed, setting.effort.curve_spawns)
-
-
-def ppo_from_scratch(setting: Setting) -> Adapt:
-    """Return an MLP that learns by PPO alone, with as many steps as RAPID's whole phase 3."""
-    config = online_baseline(setting.config(), "ddqn")
-    per_rollout = config.adapt.ppo.num_envs * config.adapt.ppo.rollout
-    steps = max(config.adapt.steps, 2 * per_rollout)
-    ppo = replace(config.adapt.ppo, steps=steps, critic_steps=0)
-    adapt = replace(config.adapt, steps=0, ppo=ppo, train="all")
-    fresh = Fresh(setting.scenario, config.network, setting.seed)
-    return Adapt(fresh, None, setting.scenario, adapt, setting.seed, setting.effort.curve_spawns)
 
 
 def the_teacher(scale: str) -> Driver:
@@ -255,7 +244,7 @@ METHODS: dict[str, Method] = {
         Method("distilled", "RAPID after phase 2", "learned", lambda s: distilled(s, _paper_data(s))),
         Method("online-dqn", "online DQN", "learned", lambda s: from_scratch(s, "dqn"), printed="Online DQN"),
         Method("online-ddqn", "online DDQN", "learned", lambda s: from_scratch(s, "ddqn")),
-        Method("online-ppo", "online PPO", "learned", ppo_from_scratch),
+        Method("online-ppo", "online PPO", "learned", lambda s: from_scratch(s, "ppo")),
         Method(
             "rapid-without-robust",
             "RAPID without J_robust",

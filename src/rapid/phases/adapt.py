@@ -5,13 +5,14 @@ from pathlib import Path
 
 from rapid.agents.open import check_road
 from rapid.agents.saved import QAgent, load_agent, save_agent
-from rapid.config import Config, without_place
+from rapid.config import Config, NetworkConfig, without_place
 from rapid.config_io import to_dict
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
-from rapid.networks.q_network import check_memory, for_lanes, widened, with_memory
+from rapid.networks.q_network import build_network, check_memory, for_lanes, widened, with_memory
 from rapid.phases.data import learnable
 from rapid.phases.measure import learning_curve
+from rapid.presets import OnlineBaseline
 from rapid.progress import task
 from rapid.scenarios import get_scenario, seeing
 from rapid.seeding import stream_seed
@@ -23,6 +24,27 @@ from rapid.training.ppo import adapt_by_ppo
 
 PPO = "ppo"
 """Where, beside the record of phase 3's Q-learning, that of its second part lies."""
+
+
+ONLINE: dict[str, tuple[OnlineBaseline, str]] = {
+    "online-dqn": ("dqn", "online DQN"),
+    "online-ppo": ("ppo", "online PPO"),
+}
+"""Baselines of a run that learn online from new weights, with as many steps as RAPID's phase 3: directory, algorithm
+and name."""
+
+
+def new_agent(network: NetworkConfig, scenario: str, seed: int, out: Path) -> None:
+    """Write an agent with new weights to `out`."""
+    fresh = build_network(network, get_scenario(scenario).lanes, stream_seed(seed, "network"))
+    save_agent(out, fresh, {"name": "new weights", "phase": "new", "scenario": scenario, "seed": seed})
+
+
+def learn_online(config: Config, out: Path, name: str) -> QAgent:
+    """Let an agent with new weights learn online in the target scenario; it is written to ``out/agent``."""
+    start = out / "new"
+    new_agent(config.network, config.adapt.scenario or config.scenario, config.seed, start)
+    return adapt_agent(config, start, None, out, name)
 
 
 def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name: str = "RAPID") -> QAgent:

@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rapid.agents.saved import load_agent, remembered
 from rapid.config import Config
@@ -12,9 +13,9 @@ from rapid.data.fallbacks import fallback_notice
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.recording import Recording, load_recordings
 from rapid.files import read_json
-from rapid.phases.adapt import PPO
+from rapid.phases.adapt import ONLINE, PPO
 from rapid.phases.data import data_folders
-from rapid.presets import as_options, of_file, without_presets
+from rapid.presets import as_options, of_file, online_baseline, without_presets
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.runs import STEPS
 from rapid.training.machinery.record import load_metrics
@@ -67,7 +68,7 @@ def write_run_report(config: Config, directory: Path) -> Path:
             "offline DQN": load_metrics(directory / "distill" / "offline-dqn"),
             "behaviour cloning": load_metrics(directory / "distill" / "cloning"),
         },
-        adapt={"RAPID": [row for part in _parts(config, directory / "adapt" / "rapid") for row in load_metrics(part)]},
+        adapt=_online_records(config, directory / "adapt"),
         routing=_routing(config, directory, recordings),
         recordings=recordings,
         dataset={"driver": teacher_data.drivers, **summary(teacher_data)},
@@ -75,6 +76,21 @@ def write_run_report(config: Config, directory: Path) -> Path:
     )
     write_figures(data, directory / "figures")
     return write_report(data, directory / "report.html")
+
+
+def _online_records(config: Config, directory: Path) -> dict[str, list[dict[str, Any]]]:
+    """The records of phase 3 and of the baselines that learned online, by the agents' names."""
+    trainings = {"RAPID": (config, directory / "rapid")}
+    # Runs of earlier versions have no such baselines.
+    trainings |= {
+        name: (online_baseline(config, algorithm), directory / folder)
+        for folder, (algorithm, name) in ONLINE.items()
+        if (directory / folder).exists()
+    }
+    return {
+        name: [row for part in _parts(settings, folder) for row in load_metrics(part)]
+        for name, (settings, folder) in trainings.items()
+    }
 
 
 def _parts(config: Config, directory: Path) -> list[Path]:

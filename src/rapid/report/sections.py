@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rapid.evaluation.statistics import ENOUGH_SEEDS
-from rapid.evaluation.summary import NOT_APPLICABLE, NOT_APPLICABLE_WHY, NOT_RUN, SummaryRow, number
+from rapid.evaluation.summary import NOT_APPLICABLE, NOT_APPLICABLE_WHY, NOT_RUN, SummaryRow, ahead_of, number
 from rapid.pages.markup import Markup, facts, join, tag
 from rapid.progress import format_seconds
 from rapid.report.data import ReportData, paper_return
@@ -106,6 +106,7 @@ def results(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
             class_="caption",
         )
     )
+    parts += [tag("p", line) for line in ahead_of(run.rows, run.lead)]
     return section("results", "How they drive", *parts, _verdict(run, summaries))
 
 

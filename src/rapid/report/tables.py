@@ -22,11 +22,13 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
     scenario = get_scenario(rows[0].scenario)
     span = _span([row.metrics["episode_return"] for row in rows])
     has_paper = any(paper_return(row.agent, scenario) for row in rows)
+    has_other = scenario.reward != "progress"
     heads = [
         ("agent", "", "text"),
         ("return", "sum of rewards of an episode; bar: 95 % interval", "number"),
         *([("paper", "return that the paper prints; its ± is not explained there", "number")] if has_paper else []),
         ("IQM", "interquartile mean of the return", "number"),
+        *([("progress", "return of the same driving under the reward progress", "number")] if has_other else []),
         ("crashed", "share of episodes that end in a crash", "number"),
         ("speed", "mean speed of the ego, m/s", "number"),
         ("distance", "metres driven in an episode of at most 30 s", "number"),
@@ -46,6 +48,7 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
                 _cell(of["episode_return"], bar=span),
                 *([_paper_cell(paper)] if has_paper else []),
                 _cell(of["iqm"]),
+                *([_cell(of["progress_return"])] if has_other else []),
                 _cell(of["crashed"], 0, 100, " %"),
                 _cell(of["mean_speed"]),
                 _cell(of["distance"], 0),
