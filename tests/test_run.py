@@ -21,7 +21,9 @@ import rapid
 from rapid.agents.saved import QAgent
 from rapid.config import Config, PpoConfig
 from rapid.config_io import apply_overrides, validate
+from rapid.data.batch import TransitionBatch
 from rapid.data.dataset import load_dataset
+from rapid.data.replay import OfflineSampler
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.rollouts import run_episodes
@@ -29,6 +31,7 @@ from rapid.networks.q_network import build_network
 from rapid.options import Run
 from rapid.parsing import parse
 from rapid.phases.adapt import adapt_agent
+from rapid.phases.data import data_folders, mix_datasets
 from rapid.phases.distill import distill_agent, distill_seeds
 from rapid.phases.measure import compare
 from rapid.phases.page import report_again
@@ -36,6 +39,7 @@ from rapid.presets import offline_baseline, online_baseline, preset
 from rapid.run import run
 from rapid.runs import STEPS
 from rapid.scenarios import SLOWER
+from rapid.seeding import stream_seed
 from rapid.training.machinery.diagnostics import FORGETTING_STATES
 from rapid.training.machinery.record import load_metrics
 
@@ -143,9 +147,14 @@ def test_online_baselines_of_every_plan_can_be_trained(plan: str):
             assert (other.adapt.steps > 0, other.adapt.ppo.steps > 0) == (algorithm == "dqn", algorithm == "ppo")
 
 
-def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(finished: Path):
+def test_distillation_leaves_the_adapter_and_adaptation_the_distilled_policy(config: Config, finished: Path):
     before = rapid.load_agent(finished / "distill/rapid/agent").network.state_dict()
     after = rapid.load_agent(finished / "adapt/rapid/agent").network.state_dict()
+    new = build_network(config.network, 3, stream_seed(config.seed, "network")).state_dict()
+    adapter = [name for name in new if name.startswith("head.mixture.policies.1.")]
+    assert adapter
+    assert all(new[name].equal(before[name]) for name in adapter)
+    assert any(not new[name].equal(before[name]) for name in new)
     frozen = [name for name in before if name.startswith("head.mixture.policies.0.")]
     assert frozen
     assert all(before[name].equal(after[name]) for name in frozen)
@@ -235,6 +244,7 @@ def test_two_agents_of_one_name_stay_apart(config: Config, finished: Path, tmp_p
         ({"adapt": {"mirror": True, "scenario": "lane-4-density-2.5"}}, "mirrors the road does so on 3 lanes"),
         ({"adapt": {"vehicles": 31}, "network": {"position": "learned"}}, "weights for each of its 15 vehicles"),
         ({"adapt": {"vehicles": 10}}, "reads 15 vehicles"),
+        ({"collect": {"shard": "1/2"}}, "a run needs the whole collection"),
         ({"mix": {"size": 400}}, "collect.teacher_transitions"),
         ({"mix": {"p": 0.0}, "collect": {"teacher_transitions": 0}}, "collect.teacher_transitions"),
         ({"evaluate": {"attacks": ["pdg"]}}, "did you mean 'pgd'"),
@@ -354,11 +364,66 @@ def test_what_was_distilled_is_what_forgetting_is_told_of(config: Config, finish
         same = (network(states).argmax(1) == distilled(states).argmax(1)).double().mean().item()
     assert len(states) <= FORGETTING_STATES
     assert load_metrics(tmp_path / "ppo")[-1]["agreement"] == pytest.approx(same)
+    # Q-learning too: mirrored, and not yet trained, it does not act as what was distilled.
+    untrained = replace(adapt, learning_starts=1_000, ppo=PpoConfig())
+    adapt_agent(replace(config, adapt=untrained), agent, finished / "mix", tmp_path / "untrained")
+    network = rapid.load_agent(tmp_path / "untrained/agent").network
+    with torch.inference_mode():
+        same = (network(states).argmax(1) == distilled(states).argmax(1)).double().mean().item()
+    assert load_metrics(tmp_path / "untrained")[-1]["agreement"] == pytest.approx(same)
+    assert same < 1
 
 
 def test_adapting_needs_no_dataset(config: Config, finished: Path, tmp_path: Path):
     agent = adapt_agent(config, finished / "distill/rapid/agent", None, tmp_path / "adapted")
     assert rapid.load_agent(tmp_path / "adapted" / "agent").name == agent.name
+
+
+def test_a_mixture_in_every_batch_is_one_in_phase_3_too(
+    config: Config, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    mixed = replace(config, mix=replace(config.mix, level="batch", p=0.25))
+    mix_datasets(mixed, *data_folders(config, finished), tmp_path / "mix")
+    shares: set[float] = set()
+
+    class Watched(OfflineSampler):
+        def sample(self, size: int, *rngs: np.random.Generator) -> TransitionBatch:
+            batch = super().sample(size, *rngs)
+            shares.add(float(batch.teacher_B.float().mean()))
+            return batch
+
+    monkeypatch.setattr("rapid.training.online.OfflineSampler", Watched)
+    adapt = replace(config.adapt, offline_share=0.5, ppo=PpoConfig())
+    adapt_agent(replace(mixed, adapt=adapt), finished / "distill/rapid/agent", tmp_path / "mix", tmp_path / "adapted")
+    assert shares == {0.25}
+
+
+def test_an_agent_tells_what_was_used_not_what_was_asked_for(config: Config, finished: Path, tmp_path: Path):
+    asked = replace(
+        config,
+        scenario="lane-4-density-1",
+        network=replace(config.network, kind="mlp"),
+        adapt=replace(config.adapt, offline_share=0.5, steps=20, learning_starts=10, ppo=PpoConfig()),
+        data="somewhere",
+    )
+    adapt_agent(asked, finished / "distill/rapid/agent", None, tmp_path / "adapted")
+    told = rapid.load_agent(tmp_path / "adapted/agent").metadata
+    used = told["config"]
+    assert used["scenario"] == used["adapt"]["scenario"] == told["scenario"] == config.scenario
+    assert (used["network"]["kind"], used["adapt"]["offline_share"]) == ("rapid", 0.0)
+    assert not {"mix", "distill", "collect", "teacher", "data"} & used.keys()
+    distill_agent(asked, finished / "mix", tmp_path / "distilled")
+    used = rapid.load_agent(tmp_path / "distilled/agent").metadata["config"]
+    assert (used["scenario"], used["network"]["kind"]) == (config.scenario, "mlp")
+    assert not {"mix", "adapt", "collect", "teacher", "data"} & used.keys()
+
+
+def test_a_driver_named_twice_is_driven_once_and_as_itself(config: Config, tmp_path: Path):
+    once = compare(config, ["slower"], tmp_path / "once")
+    twice = compare(config, ["slower", "slower"], tmp_path / "twice")
+    assert [(row.agent, row.kind, row.mean_speed) for row in twice] == [
+        (row.agent, row.kind, row.mean_speed) for row in once
+    ]
 
 
 def test_a_damaged_artefact_stops_the_run_and_is_left_as_it_is(config: Config, finished: Path, tmp_path: Path):

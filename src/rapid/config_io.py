@@ -25,6 +25,15 @@ def to_dict(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def parts_of(config: Config, *sections: str) -> dict[str, Any]:
+    """Return what stands in no section, but for the given data's place, and these sections, as plain dictionaries."""
+    return {
+        name: value
+        for name, value in to_dict(config).items()
+        if name in sections or (not isinstance(value, dict) and name != "data")
+    }
+
+
 def flat(settings: dict[str, Any], where: str = "") -> dict[str, Any]:
     """Return nested settings by their dotted names."""
     found: dict[str, Any] = {}

@@ -104,6 +104,11 @@ def _warm_up(config: Config, say: Callable[[str], None]) -> None:
 def _check_whole(config: Config) -> None:
     """Look for steps of one run that cannot follow each other."""
     network, collected, mixture = config.network, config.collect, config.mix
+    if collected.shard != "1/1":
+        raise RapidError(
+            f"collect.shard is '{collected.shard}', but a run needs the whole collection. Divide it with "
+            "collect.workers."
+        )
     if config.adapt.train == "adapter" and (network.kind not in ("rapid", "mlp-mixture") or network.num_policies < 2):
         raise RapidError(
             f"adapt.train is 'adapter', but a network of kind '{network.kind}' with {network.num_policies} policies "

@@ -7,6 +7,7 @@ from rapid import checkpoint
 from rapid.data.replay import OfflineSampler, ReplayBuffer, join_batches, n_step
 from rapid.data.transitions import RANDOM, Transitions, concatenate, empty
 from rapid.errors import RapidError
+from rapid.scenarios import NUM_FEATURES, NUM_VEHICLES
 
 GAMMA = 0.9
 
@@ -128,6 +129,19 @@ def test_the_ring_holds_the_n_step_returns_of_every_world(steps, worlds):
         assert float(buffer._store.reward_B[place]) == pytest.approx(float(reward_N[row]), abs=1e-5)
         assert float(buffer._store.bootstrap_B[place]) == pytest.approx(float(bootstrap_N[row]), abs=1e-6)
         np.testing.assert_array_equal(buffer._store.next_obs_BVF[place], rows.next_obs_NVF[last_N[row]])
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_without_a_future_only_the_next_reward_counts(steps):
+    buffer = ReplayBuffer(8, 2, 0.0, steps)
+    obs, no = np.zeros((2, NUM_VEHICLES, NUM_FEATURES), np.float32), np.zeros(2, np.bool_)
+    with np.errstate(all="raise"):
+        for reward in (1.0, 2.0, 3.0):
+            buffer.add(obs, np.zeros(2, np.int64), np.full(2, reward), obs, no, no)
+        buffer.add(obs, np.zeros(2, np.int64), np.full(2, 4.0), obs, no, ~no)
+    batch = buffer.sample(200, np.random.default_rng(0))
+    assert set(batch.reward_B.tolist()) == {1.0, 2.0, 3.0, 4.0}
+    assert not batch.bootstrap_B.any()
 
 
 def test_the_oldest_is_overwritten():

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+from rapid.agents.open import kind_of
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
 from rapid.scenarios import PAPER_SCENARIOS
@@ -35,6 +36,19 @@ def test_decisions_do_not_depend_on_the_batch(crowd, name):
     alone = [teacher.decide(crowd[i : i + 1], [None], keys[i : i + 1])[0].action for i in reversed(range(len(crowd)))]
     assert together == alone[::-1]
     assert json.dumps(teacher.describe())
+
+
+@pytest.mark.parametrize("name", [*(name for name in SCRIPTED if name != "blind"), "blind:3,1,4"])
+def test_what_a_driver_does_and_is_does_not_depend_on_its_label(crowd, name):
+    keys = np.arange(len(crowd))
+    driver, renamed = (Scripted(name, 3, 0) for _ in range(2))
+    renamed.name = "faster"
+    nobody = [None] * len(crowd)
+    ours, theirs = (each.decide(crowd, nobody, keys) for each in (driver, renamed))
+    assert [decision.action for decision in ours] == [decision.action for decision in theirs]
+    assert driver.describe() == renamed.describe()
+    renamed.name = f"{name} (another)"
+    assert kind_of(driver) == kind_of(renamed) == "floor"
 
 
 def test_chance_follows_keys_and_seed(crowd):

@@ -89,6 +89,29 @@ def test_offline_transitions_are_taken_over_one_step(tmp_path, monkeypatch):
     assert set(torch.cat([batch.reward_B for batch in taken]).tolist()) <= once
 
 
+@pytest.mark.parametrize("share", [None, 0.25])
+def test_batches_keep_the_mixtures_share_of_the_teacher(tmp_path, monkeypatch, share):
+    taken = []
+
+    class Watched(online.OfflineSampler):
+        def sample(self, count, rng):
+            taken.append(super().sample(count, rng))
+            return taken[-1]
+
+    monkeypatch.setattr(online, "OfflineSampler", Watched)
+    train(tmp_path, MIXED, teacher_share=share)
+    shares = {round(float(batch.teacher_B.float().mean()), 6) for batch in taken}
+    count = len(taken[0].teacher_B)
+    assert len(taken) > 5
+    if share is None:
+        assert len(shares) > 1
+    else:
+        assert shares == {round(np.floor(share * count + 0.5) / count, 6)}
+    # The same training with other batches is another training.
+    with pytest.raises(RapidError, match="teacher_share"):
+        train(tmp_path, MIXED, teacher_share=0.75)
+
+
 @pytest.mark.parametrize(
     ("config", "stop"), [(CONFIG, 1), (CONFIG, 9), (CONFIG, 20), (MIXED, 12)], ids=["first", "early", "last", "mixed"]
 )

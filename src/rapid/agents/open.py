@@ -161,13 +161,11 @@ def check_road(agent: Any, scenario: str) -> None:
 
 def kind_of(agent: Any) -> Kind:
     """Return what kind of agent this is: its own `kind` if it has one, else by what it offers."""
-    from rapid.teacher.scripted import SCRIPTED
-
     own = getattr(agent, "kind", None)
     if own in get_args(Kind):
         return cast(Kind, own)
     if callable(getattr(agent, "decide", None)):
-        return "floor" if getattr(agent, "name", "").partition(":")[0] in SCRIPTED else "teacher"
+        return "teacher"
     return "planner" if callable(getattr(agent, "bind", None)) else "learned"
 
 

@@ -168,7 +168,8 @@ class ReplayBuffer:
             place = (slot - back) % self._steps
             age_W = self._age_KW[place]
             waiting_W = age_W > 0
-            self._reward_KW[place] += np.where(waiting_W, self._discount ** (age_W - 1.0) * reward_W, 0)
+            weight_W = self._discount ** np.maximum(age_W - 1.0, 0.0)  # an empty slot has no weight to be computed
+            self._reward_KW[place] += np.where(waiting_W, weight_W * reward_W, 0)
             ready = np.flatnonzero(waiting_W & (done_W | (age_W == self._steps)))
             bootstrap = np.where(terminated_W[ready], 0, self._discount ** age_W[ready].astype(np.float64))
             self._append(

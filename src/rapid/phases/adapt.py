@@ -6,7 +6,7 @@ from pathlib import Path
 from rapid.agents.open import check_road
 from rapid.agents.saved import QAgent, load_agent, save_agent
 from rapid.config import Config, NetworkConfig, without_place
-from rapid.config_io import to_dict
+from rapid.config_io import parts_of, to_dict
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.networks.q_network import build_network, check_memory, for_lanes, widened, with_memory
@@ -55,7 +55,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     network, seed = distilled.network, stream_seed(config.seed, "adapt")
     if agent.resolve() == (out / "agent").resolve():
         raise RapidError(f"Adapting '{agent}' into '{out}' would replace the agent itself. Choose another directory.")
-    offline = learnable(load_dataset(data)) if data else None
+    dataset = load_dataset(data) if data else None
+    offline = learnable(dataset) if dataset else None
     if settings.memory or network.memory is not None:
         check_memory(replace(network.config, mirror=network.config.mirror or settings.mirror))
     # Of what was distilled, before it is mirrored or sees farther.
@@ -91,6 +92,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 progress=work,
                 make_worlds=lambda count: make_vec(scenario, count, config.simulator, config=seen),
                 track=tracker.log,
+                teacher_share=dataset.teacher_share if dataset else None,
+                forgetting=forgetting,
             )
         if settings.ppo.steps:
             if settings.memory:
@@ -109,5 +112,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 track=tracker.log,
             )
     metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
-    save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
+    # What was used, which need not be what was asked for.
+    used = replace(config, scenario=scenario, network=network.config, adapt=replace(settings, scenario=scenario))
+    save_agent(out / "agent", network, metadata | {"config": parts_of(used, "network", "adapt")})
     return QAgent(network, name)

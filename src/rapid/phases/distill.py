@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rapid.agents.saved import QAgent, save_agent
 from rapid.config import Config, without_place
-from rapid.config_io import to_dict
+from rapid.config_io import parts_of, to_dict
 from rapid.data.dataset import Dataset, load_dataset
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, build_network
@@ -99,4 +99,5 @@ def _distill_network(
 
 def _save_distilled(config: Config, data: Path, dataset: Dataset, network: QNetwork, out: Path, name: str) -> None:
     metadata = {"name": name, "phase": "distill", "data": str(data), "scenario": dataset.scenario, "seed": config.seed}
-    save_agent(out / "agent", network, metadata | {"config": to_dict(config)})
+    used = replace(config, scenario=dataset.scenario, network=network.config)
+    save_agent(out / "agent", network, metadata | {"config": parts_of(used, "network", "distill")})

@@ -71,6 +71,7 @@ def compare(
     if not specs:
         raise RapidError(f"Which agents? Name their directories, ONNX files or drivers, such as {', '.join(FLOORS)}.")
     check(config)
+    specs = list(dict.fromkeys(specs))
     # Opened once: a language model takes long to load, and as much memory again.
     opened = {spec: _open(config, spec, config.scenario) for spec in specs}
     names = [_checked_name(config, opened[spec]) for spec in specs]

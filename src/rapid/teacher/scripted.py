@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError, did_you_mean
+from rapid.evaluation.metrics import Kind
 from rapid.files import read_json
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, SLOWER, get_scenario
 from rapid.seeding import stream_seed
@@ -37,6 +38,8 @@ class Scripted:
         RapidError: there is no driver of this name, or no plan for `blind`.
     """
 
+    kind: Kind = "floor"
+
     def __init__(self, name: str, lanes: int, seed: int, scenario: str = "") -> None:
         kind, _, plan = name.partition(":")
         if kind not in SCRIPTED or (plan and kind != "blind"):
@@ -44,13 +47,15 @@ class Scripted:
                 f"Unknown scripted driver '{name}'{did_you_mean(name, SCRIPTED)} Choose one of {', '.join(SCRIPTED)}."
             )
         self.name = name
+        """How it is labelled; may be changed."""
+        self._driver = name
         self._lanes = lanes
         self._seed = stream_seed(seed, f"teacher/{name}")
         self.plan = (read_plan(plan) if plan else plan_for(scenario)) if kind == "blind" else None
 
     def describe(self) -> dict[str, Any]:
         """Return the driver's identity."""
-        return {"backend": "scripted", "model": self.name} | ({"plan": list(self.plan)} if self.plan else {})
+        return {"backend": "scripted", "model": self._driver} | ({"plan": list(self.plan)} if self.plan else {})
 
     def decide(
         self,
@@ -63,7 +68,7 @@ class Scripted:
         scenes = read_scenes(obs_BVF, self._lanes)
         if self.plan is not None:
             chosen = [_follow(self.plan, before) for before in previous]
-        elif self.name == "immune":
+        elif self._driver == "immune":
             chosen = [_wait(bool((presence_V >= 0.5).any())) for presence_V in np.asarray(obs_BVF)[:, 1:, 0]]
         else:
             chosen = [self._choose(scene, keys_B, world) for world, scene in enumerate(scenes)]
@@ -76,14 +81,14 @@ class Scripted:
     def _choose(
         self, scene: Scene, keys_B: NDArray[np.int64] | None, world: int
     ) -> tuple[int, str, tuple[float, ...] | None]:
-        if self.name in _CONSTANTS:
-            return _CONSTANTS[self.name], "", None
-        if self.name in _RULES:
-            action, explanation = _RULES[self.name](gather(scene))
+        if self._driver in _CONSTANTS:
+            return _CONSTANTS[self._driver], "", None
+        if self._driver in _RULES:
+            action, explanation = _RULES[self._driver](gather(scene))
             return action, explanation, None
-        choices = list(range(NUM_ACTIONS)) if self.name == "random" else safe_actions(gather(scene))
+        choices = list(range(NUM_ACTIONS)) if self._driver == "random" else safe_actions(gather(scene))
         if keys_B is None:
-            raise RapidError(f"The driver '{self.name}' draws at random: pass `keys_B`, one number per decision.")
+            raise RapidError(f"The driver '{self._driver}' draws at random: pass `keys_B`, one number per decision.")
         # Not a shared generator: each draw depends on its own key, however the worlds are batched.
         generator = np.random.default_rng((self._seed, int(keys_B[world]) & (2**64 - 1)))
         probabilities = tuple(float(action in choices) / len(choices) for action in range(NUM_ACTIONS))

@@ -44,6 +44,8 @@ def adapt(
     make_worlds: MakeWorlds | None = None,
     checkpoint_seconds: float = 60.0,
     track: Track | None = None,
+    teacher_share: float | None = None,
+    forgetting: Forgetting | None = None,
 ) -> QNetwork:
     """Train `network` in place by driving and return it; the same call goes on from the last checkpoint.
 
@@ -59,6 +61,8 @@ def adapt(
         make_worlds: gives a vector environment of so many worlds with SAME_STEP autoreset; None is `rapid.make_vec`.
         checkpoint_seconds: time between two checkpoints.
         track: is given every row of metrics.
+        teacher_share: share of teacher transitions among the offline ones of every batch; None is as they lie.
+        forgetting: compares with what was distilled; None compares with `network` as it is given.
 
     Raises:
         RapidError: settings that do not fit the data, a loss that is not finite (the last good checkpoint stays), or a
@@ -79,11 +83,12 @@ def adapt(
             "data": data_fingerprint(offline) if offline is not None else None,
             "scenario": scenario,
             "seed": seed,
+            **({"teacher_share": teacher_share} if teacher_share is not None else {}),
         },
         checkpoint_seconds,
         track,
     )
-    forgetting = Forgetting(network, offline, seed)
+    forgetting = forgetting or Forgetting(network, offline, seed)
     if config.train == "scratch":
         fresh = build_network(network.config, network.lanes, stream_seed(seed, "adapt/network"))
         network.load_state_dict(fresh.state_dict())
@@ -98,9 +103,9 @@ def adapt(
     vehicles = network.config.vehicles
     buffer = ReplayBuffer(config.buffer_size, worlds_count, loss.discount, loss.n_step, device, vehicles)
     # Over several steps the offline rewards would be those of other drivers, half of them random.
-    sampler = (
-        OfflineSampler(offline, loss.discount, 1, device, vehicles=vehicles) if offline and offline_count else None
-    )
+    sampler = None
+    if offline and offline_count:
+        sampler = OfflineSampler(offline, loss.discount, 1, device, teacher_share, vehicles)
     rng = numpy_stream(seed, "adapt/exploration and batches")
     drive = Drive(make_worlds or default_worlds(scenario, vehicles), worlds_count, seed)
     explorer = Explorer(worlds_count, config.exploration_hold)
