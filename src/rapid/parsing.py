@@ -10,8 +10,9 @@ from rapid.bounds import check_bounds
 from rapid.config import PLANS, RECIPES, SCALES, Config
 from rapid.config_io import apply_overrides, load_toml, validate
 from rapid.errors import RapidError
-from rapid.options import Certify, Evaluate, Play, Run, Source
+from rapid.options import Evaluate, Run, Source
 from rapid.presets import of_file, preset, without_presets
+from rapid.tool_options import Certify, Play
 from rapid.usage import check_options, short_help
 
 T = TypeVar("T")
