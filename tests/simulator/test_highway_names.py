@@ -187,6 +187,18 @@ def test_configuring_an_environment_changes_nobody_elses() -> None:
     assert mine == {"observation": {"vehicles_count": 6}}
 
 
+def test_a_configuration_may_hold_arrays() -> None:
+    speeds = np.array([10.0, 20.0, 30.0])
+    env = make_env(FAST, config={"action": {"target_speeds": speeds}})
+    env.reset(seed=0)
+    state = env.state
+    env.reset(seed=0)
+    assert env.state is state  # nothing changed, nothing is built anew
+    env.config["action"]["target_speeds"] = speeds + 1
+    env.reset(seed=0)
+    assert env.settings.target_speeds.tolist() == [11.0, 21.0, 31.0]
+
+
 def test_some_worlds_cannot_be_configured_alone() -> None:
     worlds = make_vec(FAST, 2, autoreset=False)
     worlds.reset(seed=0)

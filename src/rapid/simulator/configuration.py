@@ -67,7 +67,10 @@ class Configuration:
     @property
     def changed(self) -> bool:
         """Whether the values are others than the settings were read from."""
-        return not _equal(self.values, self._as_read)
+        try:
+            return bool(self.values != self._as_read)
+        except ValueError:  # somewhere in it are arrays, which have no truth
+            return not _equal(self.values, self._as_read)
 
     def refresh(self) -> bool:
         """Read the values again if they were changed, and return whether they were.

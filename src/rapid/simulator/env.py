@@ -137,7 +137,8 @@ class CompiledHighwayEnv(HighwayViews, gymnasium.Env[NDArray[np.float32], np.int
         Raises:
             RapidError: an unknown option, or a configuration that the compiled simulator does not cover.
         """
-        self._configuration.configure(split_options(options, ("config",)).get("config"))
+        if options:
+            self._configuration.configure(split_options(options, ("config",)).get("config"))
         if self._configuration.refresh():
             self._build()
         super().reset(seed=seed)
@@ -166,12 +167,14 @@ class CompiledHighwayEnv(HighwayViews, gymnasium.Env[NDArray[np.float32], np.int
         step_worlds(self.state, actions.reshape(1), self.settings, CONTINUE, out)
         if before is not None:
             self._play(before, int(actions.reshape(1)[0]))
+        info = info_of(out.info[0])
+        info["action"] = actions.item()
         return (
             out.observations[0].copy(),
             float(out.rewards[0]),
             bool(out.terminated[0]),
             bool(out.truncated[0]),
-            info_of(out.info[0]) | {"action": actions.item()},
+            info,
         )
 
     def snapshot(self) -> Snapshot:
