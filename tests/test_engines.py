@@ -64,7 +64,7 @@ def test_engines_that_cannot_be_had(monkeypatch):
     with pytest.raises(RapidError, match="did you mean 'ray'"):
         list(run_jobs(job, [1], engine="rax"))  # type: ignore[arg-type]
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(RapidError, match=r"pip install 'rapid-driving\[ray\]'; or use --engine local"):
+    with pytest.raises(RapidError, match=r"-e '\.\[ray\]'.*; or use --engine local"):
         list(run_jobs(job, [1], engine="ray"))
 
 

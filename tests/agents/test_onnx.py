@@ -163,10 +163,10 @@ def test_missing_files_and_packages_are_explained(roads, tmp_path, monkeypatch):
     with pytest.raises(RapidError, match="cannot be loaded"):
         OnnxAgent(tmp_path / "bad.onnx")
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(RapidError, match=r"rapid-driving\[export\]"):
+    with pytest.raises(RapidError, match=r"-e '\.\[export\]'"):
         export_onnx(make(kind="mlp"), tmp_path / "x.onnx", roads(1).numpy())
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(RapidError, match=r"rapid-driving\[export\]"):
+    with pytest.raises(RapidError, match=r"-e '\.\[export\]'"):
         OnnxAgent(tmp_path / "bad.onnx")
 
 

@@ -43,7 +43,7 @@ def texts(tmp_path_factory):
     return {kind: f"{kind}:{folder}" if kind == "transfer" else kind for kind in KINDS}
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "world"])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("world", "adversary")])
 @pytest.mark.parametrize(
     "options", ["", "presence=free", "ego=trusted", "radius=0.03", "metres=1,speed=0.5", "radius=0"]
 )
@@ -174,7 +174,9 @@ def test_what_an_agent_offers_decides_which_attacks_can_be_made(roads, texts):
     assert offers(object()) == ("nothing",)
     assert offers(Bound()) == ()
     needs = {kind: get_attack(text).needs for kind, text in texts.items()}
-    assert {kind for kind, need in needs.items() if need == "gradient"} == {"fgsm", "pgd", "directed", "coupled"}
+    assert {kind for kind, need in needs.items() if need == "gradient"} == {
+        "fgsm", "pgd", "directed", "coupled", "adversary"
+    }  # fmt: skip
     assert {kind for kind, need in needs.items() if need == "nothing"} == {
         "none", "uniform", "gaussian", "transfer", "lie"
     }  # fmt: skip
