@@ -1,0 +1,60 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rapid
+from rapid.agents.onnx import OnnxAgent
+from rapid.agents.open import open_agent, own_scenario
+from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, card, listing, shipped_agents
+from rapid.errors import RapidError
+from rapid.evaluation.rollouts import run_episodes
+from rapid.files import sha256
+from rapid.spawns import spawn_seeds
+
+NAMES = shipped_agents()
+
+
+def test_there_are_some():
+    assert "lane-3-density-2/robust" in NAMES
+    assert sum(path.stat().st_size for name in NAMES for path in agent_folder(f"shipped:{name}").iterdir()) < 10e6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_shipped_agent_is_what_its_card_says(name: str):
+    folder, about = agent_folder(f"shipped:{name}"), card(name)
+    assert about["name"] == f"shipped:{name}"
+    assert about["scenario"] == name.partition("/")[0]
+    assert about["weights_sha256"] == sha256(folder / "weights.safetensors")
+    assert {"none", "uniform", "gaussian", "fgsm", "pgd", "worst"} <= about["scores"].keys()
+    assert about["limits"]
+    for path in (folder / CARD_FILE, folder / "config.json"):
+        # Nothing of the machine on which it was made.
+        assert not any(word in path.read_text() for word in ("/home/", "/work/", "/tmp/", "/root/"))
+    if isinstance(about["onnx"], dict):
+        assert about["onnx"]["sha256"] == sha256(folder / ONNX_FILE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_shipped_agent_drives_as_its_onnx_file_does(name: str):
+    scenario = name.partition("/")[0]
+    agent, seeds = rapid.load_agent(f"shipped:{name}"), spawn_seeds("tune", 3)
+    ours = run_episodes(agent, scenario, seeds)
+    theirs = run_episodes(OnnxAgent(agent_folder(f"shipped:{name}") / ONNX_FILE), scenario, seeds)
+    assert np.allclose(ours.return_E, theirs.return_E)
+
+
+def test_names_are_taken_wherever_an_agent_is_expected():
+    assert own_scenario(["slower", "shipped:lane-3-density-2/robust"]) == "lane-3-density-2"
+    assert open_agent("shipped:lane-3-density-2/robust", "lane-3-density-2").act is not None
+    assert "shipped:lane-3-density-2/robust" in listing()
+    with pytest.raises(RapidError, match="did you mean 'lane-3-density-2/robust'"):
+        rapid.load_agent("shipped:lane-3-density-2/robus")
+    with pytest.raises(RapidError, match="different scenarios"):
+        own_scenario(["shipped:lane-3-density-2/robust", "shipped:lane-4-density-2.5/robust"])
+
+
+def test_cards_are_json_that_a_reader_can_use():
+    for name in NAMES:
+        assert json.loads(Path(agent_folder(f"shipped:{name}") / CARD_FILE).read_text())["licence"] == "Apache-2.0"
