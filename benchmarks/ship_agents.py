@@ -84,8 +84,12 @@ def main() -> None:
                 )
             rows += load_rows(part)
     home = PACKAGE / scenario.replace(":", "-") / "agents" / chosen.name
-    for file in (CONFIG_FILE, WEIGHTS_FILE):
-        write_bytes(home / file, (chosen.agent / file).read_bytes())
+    write_bytes(home / WEIGHTS_FILE, (chosen.agent / WEIGHTS_FILE).read_bytes())
+    config = read_json(chosen.agent / CONFIG_FILE, "agent")
+    for name in ("from", "data"):  # where they lay on this machine is nobody's business
+        if name in config["metadata"]:
+            config["metadata"][name] = Path(config["metadata"][name]).name
+    write_json(home / CONFIG_FILE, config)
     shipped = load_agent(home)
     try:
         parity = export_onnx(shipped, home / ONNX_FILE, *driven_observations(shipped, scenario, seeds[:4]))

@@ -35,7 +35,9 @@ LABELS: dict[str, dict[str, str]] = {
         "online DDQN, 10K": "online-ddqn-10k",
         "online Munchausen DQN, 300K + 700K PPO": "mlp-ppo",
         "RAPID, 10K": "rapid-10k",
-        "RAPID, robust": "rapid-robust",
+        "RAPID, adapted under attack": "rapid-robust",
+        # The same weights on wider roads.
+        "RAPID, adapted under attack on lane-3": "rapid-robust",
         "RAPID, 300K + 700K PPO": "rapid-ppo",
         "RAPID, 100K, from 60K + 700K PPO": "rapid-ppo-more-data",
         "distilled, no J_robust": "distilled-without-robust",
@@ -60,7 +62,7 @@ LABELS: dict[str, dict[str, str]] = {
 }
 """Method ids by the labels of the committed rows, by recipe."""
 FILES: dict[str, tuple[str, ...]] = {
-    "strong": ("floors.parquet", "scores.parquet", "scores-progress.parquet", "robust.parquet"),
+    "strong": ("floors.parquet", "scores.parquet", "scores-progress.parquet", "robust-first.parquet"),
     "paper": ("scores-paper.parquet",),
 }
 """Files of ``results/`` with rows over the 200 test spawns. Rows of the recipe `paper` were driven with presence left
