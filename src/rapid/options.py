@@ -207,7 +207,7 @@ class Adversary:
     """Where it is attacked."""
     attack: str = "adversary"
     """The ball and the search in it, such as adversary:radius=0.05,ego=trusted (docs/attacks.md)."""
-    steps: Annotated[int, arg(metavar="INT")] = EvaluateConfig.adversary_steps
+    steps: Positive = EvaluateConfig.adversary_steps
     """Decisions to learn from."""
     out: str = ""
     """Directory of the adversary; by default adversary, or adversary-HASH

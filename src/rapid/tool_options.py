@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rapid.bounds import Bounds, Count, Positive, Seed
+from rapid.bounds import AboveZero, Bounds, Count, Positive, Seed
 from rapid.config import CollectConfig, Config, Recipe, Scale, TeacherConfig
 from rapid.options import Flat, Source
 from rapid.scenarios import PAPER_SCENARIOS
@@ -48,7 +48,7 @@ class Certify:
 
     agent: Annotated[Positional[str], arg(metavar="AGENT")]
     """Directory of the agent, perhaps behind shield:BOX:."""
-    radii: tuple[float, ...] = (0.0005, 0.001, 0.005)
+    radii: tuple[AboveZero, ...] = (0.0005, 0.001, 0.005)
     """Radii of the attacks (L-infinity, features scaled to +-1: 0.0005 is 0.1 m along the road and 0.04 m/s)."""
     decisions: Positive = 100
     """Decisions that are certified for each radius. A perceptron's take milliseconds, a mixture's about a second."""
