@@ -35,6 +35,8 @@ VERBS: dict[str, str] = {
     "play": "open a live page: watch agents drive side by side, attack them, drive yourself",
     "presets": "print what a recipe, a scale and a plan set, or where two differ",
     "agents": "list the trained agents that come with the package",
+    "push": "put an agent or a dataset on the Hugging Face Hub, with its card",
+    "pull": "fetch an agent or a dataset from the Hugging Face Hub, checked",
     "models": "list, fetch, verify and remove the embedded language models",
     "verify-simulator": "hold the compiled simulator against highway-env, step by step",
     "doctor": "check this machine and say what to do about each failure",

@@ -12,3 +12,12 @@ _UNPRINTABLE = re.compile(
 def printable(text: str) -> str:
     """Return `text` with ``U+FFFD`` for every character that a terminal may obey or that no file can hold."""
     return _UNPRINTABLE.sub("\ufffd", text.replace("\r\n", "\n").replace("\r", "\n"))
+
+
+# Not in it, as they mark nothing inside a line: space , ; ' " % - and brackets without the square ones before them.
+_MARKS = re.compile(r"[!#$&*+./:<=>?@\[\\\]^_`{|}~]")
+
+
+def in_markdown(text: str) -> str:
+    """Return `text` as one line of Markdown that shows it letter by letter: no mark-up, link, HTML or table cell."""
+    return _MARKS.sub(r"\\\g<0>", " ".join(printable(text).split()))

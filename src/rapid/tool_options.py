@@ -179,6 +179,38 @@ class Agents:
 
 
 @dataclass(frozen=True)
+class Push:
+    """Put an agent or a dataset, with its card, on the Hugging Face Hub.
+
+    Only weights as safetensors, ONNX, JSON, Parquet and the card are sent. The token is that of `hf auth login` or of
+    HF_TOKEN.
+    """
+
+    path: Annotated[Positional[str], arg(metavar="AGENT_OR_DATASET")]
+    """Directory of the agent or dataset, or a shipped one."""
+    repository: Annotated[Positional[str], arg(metavar="OWNER/NAME")]
+    """Where to on the hub; made if it is not there."""
+    public: bool = False
+    """Let everyone see a repository that is made; without it only its owner does. One that exists stays as it is."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Fetch an agent or a dataset from the Hugging Face Hub and check it whole, before it is put in its place.
+
+    Only weights as safetensors, ONNX, JSON, Parquet and the card are fetched; pickles and whatever else is there is
+    left out.
+    """
+
+    repository: Annotated[Positional[str], arg(metavar="OWNER/NAME")]
+    """Where from; datasets/OWNER/NAME is the dataset if there is an agent of this name too."""
+    out: str = ""
+    """Directory for it; by default NAME."""
+    revision: str = ""
+    """Branch, tag or commit; by default the newest of the main branch."""
+
+
+@dataclass(frozen=True)
 class Models:
     """List the embedded language models, fetch one, verify it, or remove it."""
 

@@ -21,6 +21,8 @@ from rapid.tool_options import (
     Models,
     Play,
     Presets,
+    Pull,
+    Push,
     Report,
     Reproduce,
     TeachBench,
@@ -191,6 +193,20 @@ def agents(options: Agents, config: Config) -> int:
     if options.action != "show":
         raise RapidError(f"'{options.action}' is nothing to do with agents. Say list, or show NAME.")
     print(json.dumps(card(options.name.removeprefix("shipped:")), indent=2))
+    return 0
+
+
+def push(options: Push, config: Config) -> int:
+    from rapid.hub import push
+
+    print(push(options.path, options.repository, options.public).told())
+    return 0
+
+
+def pull(options: Pull, config: Config) -> int:
+    from rapid.hub import pull
+
+    print(pull(options.repository, options.out, options.revision).told())
     return 0
 
 

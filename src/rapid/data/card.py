@@ -7,6 +7,7 @@ from rapid.data.dataset import LICENCE, Dataset, summary
 from rapid.data.fallbacks import fallback_notice
 from rapid.data.transitions import SOURCES
 from rapid.scenarios import get_scenario
+from rapid.text import in_markdown, printable
 
 
 def card(dataset: Dataset) -> str:
@@ -31,7 +32,7 @@ def card(dataset: Dataset) -> str:
             score = f"{row['return_mean']:.2f} ± {row['return_std']:.2f}"
             quartiles = " / ".join(f"{value:.1f}" for value in row["return_quantiles"])
             crashed = f"{row['crash_share']:.1%}"
-        driver = dataset.drivers.get(name, {}).get("name", "unknown")
+        driver = in_markdown(str(dataset.drivers.get(name, {}).get("name", "unknown")))
         lines.append(
             f"| {name} | {driver} | {facts[name]['transitions']} | {row.get('episodes', '–')} | {score} "
             f"| {quartiles} | {crashed} | {row['mean_speed']:.1f} |"
@@ -56,14 +57,15 @@ def card(dataset: Dataset) -> str:
         lines += ["", "## Memory", "", *_memory_lines(facts["memory"])]
     lines += ["", "## Drivers"]
     for name, identity in dataset.drivers.items():
-        lines += ["", f"`{name}`:", "", "```json", json.dumps(identity, indent=2, ensure_ascii=False), "```"]
+        # JSON on lines of its own: no text in it can begin a line, and so none can end the fence.
+        lines += ["", f"{in_markdown(name)}:", "", "```json", json.dumps(identity, indent=2, ensure_ascii=False), "```"]
     lines += ["", "## Reading it", "", *_READING]
-    return "\n".join(lines) + "\n"
+    return printable("\n".join(lines)) + "\n"
 
 
 def _decision_lines(decisions: dict[str, Any], count: int) -> list[str]:
     """Return what the log adds up to, as a list."""
-    status = ", ".join(f"{name} {amount}" for name, amount in decisions["status"].items())
+    status = ", ".join(f"{in_markdown(name)} {amount}" for name, amount in decisions["status"].items())
     read, written = (f"{decisions[name]:.0f}" for name in ("tokens_in", "tokens_out"))
     return [
         f"- Status: {status}; {decisions['retries']:g} retries",
