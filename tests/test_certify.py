@@ -187,6 +187,9 @@ def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path,
     assert [rate["safe"]["value"] for rate in found["decisions"]] == [1, 1]
     assert found["decisions"][0]["unchanged"]["value"] == 1
     assert found["returns"][0]["least"] == pytest.approx(found["returns"][0]["clean"])
+    assert call(f"{tmp_path}/agent", *small) == 2  # another certificate is not replaced
+    assert "--force" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "certificate.json").read_text()) == found
     shutil.rmtree(tmp_path / "out")
     for words, said in (
         ((str(tmp_path / "agent"), "--radii", "0.001", "-1"), "within a radius"),
@@ -196,7 +199,7 @@ def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path,
     ):
         assert call(*words) == 2
         assert said in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
+        assert not list((tmp_path / "out").glob("certificate*"))
 
 
 def test_what_cannot_be_certified_is_refused():

@@ -60,6 +60,8 @@ class Certify:
     """Where it drives; by default where it was trained."""
     out: str = "certificate"
     """Directory of the table and the numbers."""
+    force: bool = False
+    """Replace a certificate that is there."""
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ ROUNDING = 1e-4
 """By how much a difference must exceed 0 to count as proven: networks compute in single precision, bounds do not."""
 
 
-CHUNK = 8
-"""Observations that are bounded at once, which memory limits."""
+CHUNK_PERCEPTRON, CHUNK_TOKENS = 16, 1
+"""Observations that are bounded at once. A mixture's forms take hundreds of megabytes each."""
 
 
 class Bounds:
@@ -54,7 +54,8 @@ class Bounds:
 
         Presence, rounded, counts as what it is in the middle of the box. Where a bound overflows it is NaN.
         """
-        parts = zip(low_BVF.double().cpu().split(CHUNK), high_BVF.double().cpu().split(CHUNK), strict=True)
+        chunk = CHUNK_TOKENS if isinstance(self.network.head, TokenHead) else CHUNK_PERCEPTRON
+        parts = zip(low_BVF.double().cpu().split(chunk), high_BVF.double().cpu().split(chunk), strict=True)
         return torch.cat([self._differences(low, high) for low, high in parts])
 
     def _differences(self, low_BVF: Tensor, high_BVF: Tensor) -> Tensor:
