@@ -52,9 +52,10 @@ def certify(options: Certify, config: Config) -> int:
 
     agent = network_agent(options.agent)
     check_road(agent, config.scenario)
-    out = Path(options.out)
-    counts = options.decisions, options.spawns, options.returns
-    print(certify(agent, config.scenario, options.radii, *counts, out), end="")
+    out, counts = Path(options.out), (options.decisions, options.spawns, options.returns)
+    with exclusive_file(out / "certificate.json"):
+        check_new_file(out / "certificate.json", options.force)
+        print(certify(agent, config.scenario, options.radii, *counts, out), end="")
     return 0
 
 
