@@ -176,7 +176,7 @@ def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path,
             main(["certify", *words, "--out", str(tmp_path / "out")])
         return ended.value.code
 
-    small = ("--decisions", "12", "--spawns", "3", "--returns", "1", "--radii", "0", "0.001")
+    small = ("--decisions", "12", "--spawns", "3", "--returns", "1", "--radii", "0.000001", "0.001")
     assert call(f"shield:0.01:{tmp_path}/agent", *small) == 0
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "out" / "certificate.txt").read_text()
@@ -192,7 +192,7 @@ def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path,
     assert json.loads((tmp_path / "out" / "certificate.json").read_text()) == found
     shutil.rmtree(tmp_path / "out")
     for words, said in (
-        ((str(tmp_path / "agent"), "--radii", "0.001", "-1"), "within a radius"),
+        ((str(tmp_path / "agent"), "--radii", "0.001", "0.6"), "radi"),
         ((str(tmp_path / "agent"), "--spawns", "2", "--returns", "3"), "Ask for more"),
         (("slower",), "no agent"),
         ((str(tmp_path / "agent"), "--scenario", f"{SCENARIO}:progress", "--returns", "1"), "never negative"),
