@@ -17,6 +17,7 @@ from rapid.evaluation.summary import label_of
 from rapid.evaluation.worlds import Perturbation
 from rapid.pages.episodes import frame, rounded, seen
 from rapid.play.roster import You
+from rapid.safety import IntervalFilter
 from rapid.scenarios import ACTIONS, MAX_VEHICLES, NUM_ACTIONS, NUM_VEHICLES, get_scenario, seeing
 from rapid.teacher.decision import answer_in_words, computed_in_words
 
@@ -213,11 +214,7 @@ def check_action(action: object) -> int:
     return action
 
 
-def verdict(seen_BVF: NDArray[np.float32], lanes: int, radius: float) -> dict[str, Any] | None:
+def verdict(seen_BVF: NDArray[np.float32], lanes: int, radius: float) -> dict[str, Any]:
     """Return which actions are safe for every true state within `radius` of what is seen, by the interval filter."""
-    try:
-        from rapid.safety import IntervalFilter  # pyright: ignore
-    except ImportError:
-        return None
-    margins: Any = IntervalFilter(lanes, radius).margins(seen_BVF)[0]
+    margins = IntervalFilter(lanes, f"{radius:g}").margins(seen_BVF)[0]
     return {"safe": [bool(margin >= 0) for margin in margins], "spare": [rounded(min(m, 999.0), 1) for m in margins]}
