@@ -1,11 +1,13 @@
 """A key in the environment stays there, whatever a server does with it: no file, no line of output, no error has it."""
 
+import base64
 import itertools
 import json
 import logging
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 import pyarrow.parquet as pq
 import pytest
@@ -34,7 +36,13 @@ def server(monkeypatch) -> Iterator[Server]:
 
 def spellings(key: str) -> set[str]:
     once = json.dumps(key)[1:-1]
-    return {key, once, json.dumps(once)[1:-1], repr(key)[1:-1]}
+    return {key, once, json.dumps(once)[1:-1], repr(key)[1:-1], *encoded(key)}
+
+
+def encoded(key: str) -> list[str]:
+    """Other forms in which a server may repeat a key."""
+    content = key.encode()
+    return [base64.b64encode(content).decode().rstrip("="), content.hex(), content.hex().upper(), quote(key, safe="")]
 
 
 def leaks(key: str, text: str) -> bool:
@@ -57,6 +65,7 @@ def words(server: Server, out: Path, style: str) -> list[str]:
         "teacher.style": style,
         "teacher.base-url": server.url,
         "teacher.api-key-env": "RAPID_TEST_KEY",
+        "teacher.headers-env": "RAPID_TEST_HEADERS",
         "teacher.max-retries": "1",
         "teacher.max-turns": "2",
         "teacher-transitions": "12",
@@ -85,6 +94,9 @@ def faults(key: str) -> list:
         answer({"choices": [], "error": key}),
         answer(completion(key)),
         answer(completion(None, refusal=f"I know {key}.")),
+        answer(completion(f"You are {' or '.join(encoded(key))}.")),
+        answer({**completion("faster"), "model": f"m of {encoded(key)[0]}"}),
+        refuse(500, f"Basic {base64.b64encode(f'user:{key}'.encode()).decode()}"),
         answer(completion(said, {"content": [{"token": key, "logprob": 0.0, "top_logprobs": []}]})),
         answer(completion(None, tool_calls=[call])),
         drop,
@@ -96,6 +108,7 @@ def faults(key: str) -> list:
 def test_a_collection_leaks_no_key(server, tmp_path, monkeypatch, capfd, caplog, style, key):
     caplog.set_level(logging.DEBUG)
     monkeypatch.setenv("RAPID_TEST_KEY", key)
+    monkeypatch.setenv("RAPID_TEST_HEADERS", f"X-Key: {key}")
     good = answer(completion(json.dumps({"explanation": "free road", "lesson": "look ahead", "action": "faster"})))
     played = itertools.chain.from_iterable((fault, good) for fault in faults(key))
     refused = refuse(401, f"Incorrect API key provided: {key}.", **{"WWW-Authenticate": f"Bearer {key}"})

@@ -10,6 +10,9 @@ import pytest
 
 from fake_server import Server, answer, completion, refuse
 from rapid.config import TeacherConfig
+from rapid.data.card import card
+from rapid.data.collection import collect
+from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.teacher import make_teacher
 from rapid.teacher.chat import ChatError, Reply, Request, ToolCall
@@ -408,6 +411,13 @@ def test_another_model_than_asked_for_is_told(server, capsys):
     endpoint = Endpoint(settings(server))
     assert [endpoint.ask(QUESTION).model for _ in range(2)] == ["n-2\ufffd[1m"] * 2
     assert capsys.readouterr().err.count("calls itself 'n-2\ufffd[1m'") == 1
+
+
+def test_the_model_s_own_name_is_recorded_and_on_the_card(server, tmp_path):
+    server.acts = [answer({**completion("keep"), "model": "n-2024"})]
+    collect(driver(server), "lane-3-density-2-fast", tmp_path, 20, 2)
+    assert set(load_dataset(tmp_path).log.column("served").to_pylist()) == {"n-2024"}
+    assert "The model called itself: n-2024" in card(load_dataset(tmp_path))
 
 
 # Before anything is driven.

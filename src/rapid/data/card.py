@@ -67,7 +67,9 @@ def _decision_lines(decisions: dict[str, Any], count: int) -> list[str]:
     """Return what the log adds up to, as a list."""
     status = ", ".join(f"{in_markdown(name)} {amount}" for name, amount in decisions["status"].items())
     read, written = (f"{decisions[name]:.0f}" for name in ("tokens_in", "tokens_out"))
+    served = ", ".join(decisions["served"])
     return [
+        *([f"- The model called itself: {served}"] if served else []),
         f"- Status: {status}; {decisions['retries']:g} retries",
         f"- {decisions['prompts']} different prompts",
         f"- {read} tokens read, {written} written, cost {decisions['cost']:g}",
@@ -91,6 +93,7 @@ _READING = (
     "crash, `truncated` the clock. `source` 0 is the teacher, 1 the random driver.",
     "- `teacher_log.parquet`: one row a decision. What the model was told first (`told`), what it answered (`answer`, "
     "and its own reason, `explanation`) and what RAPID computed about the action (`computed`) are three columns; "
-    "`turns` holds everything said after `told`, as JSON. Beside them: prompt hash, status, error, tokens, seconds.",
+    "`turns` holds everything said after `told`, as JSON. Beside them: prompt hash, status, the "
+    "model's own name (`served`), error, tokens, seconds.",
     "- `memory.jsonl`, if the teacher has a memory: one line an experience, those that it had first.",
 )

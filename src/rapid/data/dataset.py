@@ -243,6 +243,7 @@ def summary(dataset: Dataset) -> dict[str, Any]:
         decisions: dict[str, Any] = {
             "status": dict(sorted(status.items())),
             "prompts": len(log.column("prompt_hash").unique()),
+            "served": sorted(filter(None, log.column("served").unique().to_pylist())),
         }
         for name in ("retries", "tokens_in", "tokens_out", "seconds", "cost"):
             decisions[name] = _round(np.nansum(log.column(name).to_numpy().astype(np.float64)))

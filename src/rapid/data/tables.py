@@ -51,6 +51,7 @@ LOG_SCHEMA = pa.schema(
         pa.field("explanation", pa.string()),
         pa.field("computed", pa.string()),
         pa.field("status", pa.string()),
+        pa.field("served", pa.string()),
         pa.field("error", pa.string()),
         pa.field("retries", pa.int32()),
         pa.field("tokens_in", pa.int64()),
@@ -156,12 +157,15 @@ def from_table(table: pa.Table) -> Transitions:
 def current_log(table: pa.Table) -> pa.Table:
     """Return a table with the columns of the log as they are now, of one that may be from before version 0.2.
 
-    There, `transcript` held what was told together with the turns after it, and `explanation` RAPID's own words where
+    `served` was unknown there; `transcript` held what was told and the turns after it, `explanation` our words where
     the model had given no reason.
 
     Raises:
         RapidError: a transcript cannot be read.
     """
+    if "status" in table.column_names and "served" not in table.column_names:
+        place, unknown = table.schema.get_field_index("status") + 1, pa.array([""] * table.num_rows, pa.string())
+        table = table.add_column(place, pa.field("served", pa.string()), unknown)
     if "transcript" not in table.column_names:
         return table
     names = ("transcript", "answer", "explanation", "status")

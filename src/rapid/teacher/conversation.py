@@ -69,13 +69,14 @@ class _Talk:
     retries: int = 0
     answer: str = ""
     tokens: tuple[Token, ...] = ()
+    served: str = ""
     faults: list[str] = field(default_factory=list[str])
 
     def note(self, reply: Reply) -> None:
         self.tokens_in += reply.tokens_in
         self.tokens_out += reply.tokens_out
         self.retries += reply.retries
-        self.answer, self.tokens = reply.text, reply.tokens
+        self.answer, self.tokens, self.served = reply.text, reply.tokens, reply.model
 
 
 def _opening(prompt: Prompt) -> list[Message]:
@@ -258,6 +259,7 @@ class ConversingTeacher:
             turns=json.dumps(talk.messages[2:]),
             prompt_hash=prompt.hash,
             status=status,
+            served=talk.served,
             # The transport's error goes first: it says why there was no answer at all.
             error=" ".join(map(sentence, reversed(talk.faults))),
             retries=talk.retries,

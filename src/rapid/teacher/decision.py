@@ -74,6 +74,8 @@ class Decision:
     """What the model was told first, without the part of the prompt that never changes."""
     computed: str = ""
     """What RAPID itself computed about the action; no model said it."""
+    served: str = ""
+    """The model's own name, as its server told it with the answer; it may be another than was asked for."""
 
     @property
     def unanswered(self) -> bool:

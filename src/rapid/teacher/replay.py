@@ -23,7 +23,7 @@ from rapid.teacher.scene import read_scenes
 
 _FIELDS = (
     *("action", "explanation", "answer", "told", "computed", "turns", "transcript"),
-    *("prompt_hash", "status", "error", "retries"),
+    *("prompt_hash", "status", "served", "error", "retries"),
 )
 """What is repeated of a row of a Parquet log; tokens and cost were paid once."""
 
