@@ -91,4 +91,4 @@ def test_the_verb_keeps_what_is_there(tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
         main(["relabel", f"shipped:{SCENARIO}/random", "--out", str(tmp_path)])
     assert exit_.value.code == 2
-    assert "nothing is overwritten" in capsys.readouterr().err
+    assert "Nothing was changed" in capsys.readouterr().err
