@@ -20,6 +20,8 @@ from rapid.errors import RapidError, how_to_install
 
 Tracking = Literal["none", "tensorboard", "wandb", "trackio"]
 PROJECT = "rapid"
+_EXTRAS = {"tensorboard": "tracking", "wandb": "wandb", "trackio": "trackio"}
+"""The extra of this package that brings each."""
 STEPS = ("iteration", "step")
 """What counts the progress of phase 2 and of phase 3 in their rows."""
 
@@ -44,8 +46,8 @@ def check_tracking(kind: Tracking) -> None:
     """
     if kind != "none" and importlib.util.find_spec(kind) is None:
         raise RapidError(
-            f"Tracking with '{kind}' needs the package '{kind}', which is not installed. Install it with: pip install "
-            f"{kind}, or all trackers: {how_to_install('tracking')}; or use --tracking none."
+            f"Tracking with '{kind}' needs the package '{kind}', which is not installed. Install it: "
+            f"{how_to_install(_EXTRAS[kind])}; or use --tracking none."
         )
 
 

@@ -1,12 +1,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from fake_worlds import assert_equal, fake_transitions
 from rapid.data.tables import from_table, read_parquet, to_table, write_parquet
 from rapid.data.transitions import RANDOM, concatenate, empty
-from rapid.errors import RapidError
+from rapid.errors import DamagedError, RapidError
 from rapid.spawns import spawn_seeds, train_part
 
 
@@ -92,3 +94,42 @@ def test_spawn_sets_are_disjoint_and_end():
         spawn_seeds("test", 2, start=99_999)
     with pytest.raises(RapidError, match="did you mean 'test'"):
         spawn_seeds("tests", 1)
+
+
+def test_files_are_for_every_reader_and_those_of_earlier_versions_still_load(tmp_path):
+    """Lists of a fixed size with nulls among them can be read by hardly any program; earlier versions wrote them."""
+    rows = fake_transitions(6)
+    table = to_table(rows)
+    assert all(pa.types.is_list(table.schema.field(name).type) for name in ("probabilities", "obs", "next_obs"))
+    assert table.column("next_obs").null_count == len(rows) - 6
+    old = table
+    for place, (name, size) in enumerate((("probabilities", 5), ("obs", 75), ("next_obs", 75)), 8):
+        assert table.schema.names[place] == name
+        kind = pa.list_(pa.float32(), size)
+        old = old.set_column(place, name, pa.array(table.column(name).to_pylist(), kind))
+    pq.write_table(old, tmp_path / "old.parquet")
+    read = read_parquet(tmp_path / "old.parquet", "transitions")
+    assert read.schema.types == table.schema.types
+    assert_equal(from_table(read), rows)
+    assert_equal(from_table(old), rows)
+
+
+@pytest.mark.parametrize("where", [0.3, 0.5, 0.7])
+def test_one_bit_that_changed_on_the_disk_is_noticed(tmp_path, where):
+    path = tmp_path / "rows.parquet"
+    write_parquet(to_table(fake_transitions(6)), path)
+    content = bytearray(path.read_bytes())
+    content[int(where * len(content))] ^= 16
+    path.write_bytes(content)
+    with pytest.raises(DamagedError, match="cannot be read"):
+        read_parquet(path, "transitions")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("obs", [[1.0] * 74]), ("next_obs", [["a"] * 75]), ("probabilities", [3.0])]
+)
+def test_lists_of_another_kind_are_refused(name, value):
+    table = to_table(fake_transitions(1, length=1))
+    wrong = table.set_column(table.schema.get_field_index(name), name, pa.array(value))
+    with pytest.raises(RapidError, match="other columns than expected"):
+        from_table(wrong)

@@ -1,6 +1,8 @@
 """The cache of compiled kernels."""
 
+import hashlib
 import importlib.util
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -144,3 +146,29 @@ def test_a_change_of_any_kernel_makes_all_cached_kernels_stale(tmp_path: Path, m
     with (tmp_path / "simulator" / "behavior.py").open("a") as file:
         file.write("\n")
     assert stamp() != before
+
+
+class _OfAnotherVersion:
+    """Stands for a type of a numba that is not installed: to unpickle it is an error."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return importlib.import_module, ("numba.core.types.old_scalars_of_another_version",)
+
+
+@pytest.mark.parametrize("pieces", [1, 2])
+def test_an_index_of_another_numba_is_not_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pieces: int
+) -> None:
+    """After numba was updated its old types may be gone; the index of an earlier RAPID holds them in one piece."""
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiling, "_troubles", [])
+    assert _load(tmp_path)(21) == 42
+    (stored,) = (tmp_path / "cache").rglob("*.nbi")
+    parts = ("0.1", b"stamp"), {"key": _OfAnotherVersion()}
+    content = pickle.dumps((*parts[0], parts[1])) if pieces == 1 else b"".join(map(pickle.dumps, parts))
+    stored.write_bytes(content + hashlib.sha256(content).digest())
+    assert _load(tmp_path)(21) == 42
+    again = _load(tmp_path)
+    assert again(21) == 42
+    assert again.stats.cache_hits
+    assert capsys.readouterr().err == ""

@@ -47,8 +47,10 @@ class Graph:
     def node(self, kind: str, *inputs: str | Array | float, outputs: int = 1, **attributes: Any) -> Any:
         """Add a node; inputs that are numbers become constants. Return its output's name, or a list of several."""
         names = [item if isinstance(item, str) else self.constant(item) for item in inputs]
-        made = [f"n{len(self.nodes)}_{index}" for index in range(outputs)]
-        self.nodes.append(self._onnx.helper.make_node(kind, names, made, **attributes))
+        name = f"n{len(self.nodes)}"
+        made = [f"{name}_{index}" for index in range(outputs)]
+        # onnxruntime before 1.22 takes nodes without a name for one and the same when it fuses them.
+        self.nodes.append(self._onnx.helper.make_node(kind, names, made, name, **attributes))
         return made[0] if outputs == 1 else made
 
     def reshape(self, value: str, *shape: int) -> str:

@@ -3,6 +3,7 @@
 """How the kernels of this package are compiled: one thread, IEEE arithmetic, and a cache that is never stale."""
 
 import hashlib
+import io
 import pickle
 import sys
 from collections.abc import Callable
@@ -59,13 +60,18 @@ class _CheckedCacheFile(IndexDataCacheFile):
             content = _checked_content(Path(self._index_path))
             if content is None:
                 return {}
-            version, stamp, overloads = pickle.loads(content)
-            return overloads if (version, stamp) == (self._version, self._source_stamp) else {}
+            # The types of another numba's index may not exist in this one: they are not looked at before it is known.
+            stream = io.BytesIO(content)
+            try:
+                known = pickle.load(stream) == (self._version, self._source_stamp)
+                return pickle.load(stream) if known else {}
+            except Exception:  # an index of an earlier RAPID is one piece
+                return {}
 
         return self._guarded(read, {})
 
     def _save_index(self, overloads: dict[Any, Any]) -> None:
-        self._write(self._index_path, self._dump((self._version, self._source_stamp, overloads)))
+        self._write(self._index_path, self._dump((self._version, self._source_stamp)) + self._dump(overloads))
 
     def _load_data(self, name: str) -> Any:
         content = _checked_content(Path(self._data_path(name)))
