@@ -1,11 +1,13 @@
 """Statistics: known values, coverage, and what the intervals are over."""
 
 import math
+import time
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from rapid.evaluation import statistics
 from rapid.evaluation.statistics import estimate, iqm, paired_difference
 
 
@@ -121,3 +123,36 @@ def test_paired_trainings_cancel() -> None:
     assert (together.low, together.high) == (pytest.approx(1), pytest.approx(1))
     assert apart.low < 0
     assert together.unit == "5 trainings × 40 spawns"
+
+
+@pytest.mark.parametrize("statistic", ["mean", "iqm"])
+@pytest.mark.parametrize("kind", ["return", "share", "skewed"])
+def test_with_many_episodes_the_normal_interval_is_the_bootstraps(statistic, kind, monkeypatch):
+    rng = np.random.default_rng(0)
+    values = {
+        "return": rng.normal(20, 3, 5_000),
+        "share": (rng.random(5_000) < 0.4).astype(float),
+        "skewed": rng.exponential(2, 5_000),
+    }[kind]
+    if (statistic, kind) == ("iqm", "share"):
+        pytest.skip("the middle half of a share is a constant")
+    large = estimate(values, range(5_000), statistic=statistic)
+    monkeypatch.setattr(statistics, "LARGE", 10_000)
+    small = estimate(values, range(5_000), statistic=statistic, resamples=500)
+    width = small.high - small.low
+    assert large.value == small.value
+    assert large.low == pytest.approx(small.low, abs=0.1 * width)
+    assert large.high == pytest.approx(small.high, abs=0.1 * width)
+
+
+@pytest.mark.parametrize("trainings", [1, 5])
+def test_the_work_grows_with_the_episodes_not_with_their_square(trainings):
+    def seconds(count: int) -> float:
+        values = np.random.default_rng(0).normal(20, 3, count)
+        start = time.process_time()
+        spawns = [episode // trainings for episode in range(count)]
+        estimate(values, spawns, [episode % trainings for episode in range(count)], resamples=100)
+        return time.process_time() - start
+
+    seconds(1_000)
+    assert seconds(200_000) < 60 * seconds(10_000)

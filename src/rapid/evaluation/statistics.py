@@ -20,6 +20,9 @@ LEVEL = 0.95
 RESAMPLES = 2_000
 ENOUGH_SEEDS = 5
 """Training seeds below which nothing is said about a training method, only about the policies at hand."""
+LARGE = 5_000
+"""Episodes from which on an interval is the normal one: what BCa corrects falls with their number, and its work grows
+with the square."""
 _BLOCK = 1 << 22
 """Numbers held at once while resampling."""
 
@@ -70,7 +73,8 @@ def estimate(
 
     With two or more training seeds the interval is a hierarchical bootstrap: seeds are drawn with replacement, then
     spawns. If every training met the same spawns, one draw of spawns holds for all seeds drawn, because the traffic is
-    shared; else each seed draws from its own. Otherwise it is SciPy's BCa bootstrap over the episodes.
+    shared; else each seed draws from its own. Otherwise it is SciPy's BCa bootstrap over the episodes, and of `LARGE`
+    or more the normal interval.
     A share of yes and no that is all one or all the other gets Wilson's interval: resampling it would claim certainty.
     """
     numbers = np.asarray(values, np.float64)
@@ -88,7 +92,9 @@ def estimate(
     if np.ptp(kept) == 0:
         low, high = _constant_interval(float(kept[0]), counts[1])
     elif len(trained) >= 2:
-        groups = [_by_spawn(kept, spawn_N, np.array([label == one for label in seed_N], np.bool_)) for one in trained]
+        places = {one: place for place, one in enumerate(trained)}
+        place_N = np.array([places.get(label, -1) if label is not None else -1 for label in seed_N])
+        groups = [_by_spawn(kept, spawn_N, place_N == place) for place in range(len(trained))]
         draws = _hierarchical(groups, statistic, resamples, generator)
         low, high = _percentiles(draws)
     else:
@@ -156,9 +162,14 @@ def _percentiles(draws: NDArray[np.float64]) -> tuple[float, float]:
 def _constant_interval(value: float, count: int) -> tuple[float, float]:
     """Return the interval of `count` equal numbers."""
     if value in (0.0, 1.0):
-        interval = stats.binomtest(round(value * count), count).proportion_ci(LEVEL, method="wilson")
-        return float(interval.low), float(interval.high)
+        return _share_interval(round(value * count), count)
     return (value, value) if count > 1 else (math.nan, math.nan)
+
+
+def _share_interval(yes: int, count: int) -> tuple[float, float]:
+    """Return Wilson's interval of a share."""
+    interval = stats.binomtest(yes, count).proportion_ci(LEVEL, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def _bootstrap(
@@ -171,6 +182,8 @@ def _bootstrap(
 
     if len(values) < 2:
         return math.nan, math.nan
+    if len(values) >= LARGE:
+        return _normal_interval(values, statistic)
     # BCa corrects by the spread of leave-one-out values; an IQM of half-constant data has none.
     spread = np.ptp([float(of(np.delete(values, i))) for i in range(min(len(values), 64))])
     result = stats.bootstrap(
@@ -187,6 +200,25 @@ def _bootstrap(
     if math.isnan(low) or math.isnan(high):
         return _percentiles(np.asarray(result.bootstrap_distribution))
     return low, high
+
+
+def _normal_interval(values: NDArray[np.float64], statistic: Statistic) -> tuple[float, float]:
+    """Return the statistic with 1.96 standard errors to either side; of an IQM, that of a trimmed mean.
+
+    What a trimmed mean varies by is the spread of the values drawn in to the ends of the middle half (Tukey and
+    McLaughlin, 1963). A share of yes and no gets Wilson's interval, which stays between 0 and 1.
+    """
+    if statistic == "mean" and np.isin(values, (0.0, 1.0)).all():
+        return _share_interval(round(float(values.sum())), len(values))
+    kept = 1.0
+    spread = values
+    if statistic == "iqm":
+        low, high = np.quantile(values, (0.25, 0.75))
+        spread, kept = np.clip(values, low, high), 0.5
+    error = float(spread.std(ddof=1)) / (kept * math.sqrt(len(values)))
+    reach = float(stats.norm.ppf((1 + LEVEL) / 2)) * error
+    value = float(_statistic(statistic, values))
+    return value - reach, value + reach
 
 
 def _by_spawn(values: NDArray[np.float64], spawns: NDArray[np.int64], chosen: NDArray[np.bool_]) -> dict[int, float]:
@@ -215,6 +247,10 @@ def _hierarchical(
         row_RS = generator.integers(count, size=(size, count))
         if crossed:
             column = generator.integers(longest, size=(size, 1, longest))
+            if statistic == "mean":
+                # The mean over trainings first: the same number, from fewer reads.
+                draws.append(np.take_along_axis(value_SE[row_RS].mean(1), column[:, 0], 1).mean(1))
+                continue
             draws.append(_statistic(statistic, value_SE[row_RS[..., None], column].reshape(size, -1)))
             continue
         # Each training drawn counts with as many draws as it has spawns, so resamples differ in size.
