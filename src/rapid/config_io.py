@@ -100,7 +100,7 @@ def load_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise RapidError(f"Cannot read the settings file '{path}': {error}. Give the path of a TOML file.") from error
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise RapidError(f"The settings file '{path}' is not valid TOML: {error}. Correct that line.") from error
 
 

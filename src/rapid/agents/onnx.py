@@ -16,10 +16,11 @@ import numpy as np
 
 from rapid import files
 from rapid.agents.onnx_graph import build_model
-from rapid.agents.saved import QAgent, check_observations
-from rapid.errors import RapidError, how_to_install
+from rapid.agents.saved import NAME_LENGTH, QAgent, check_observations
+from rapid.errors import RapidError, how_to_install, sentence
 from rapid.networks.memory import initial_state, next_state
 from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, MIN_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
+from rapid.text import printable
 
 METADATA_KEY = "rapid"
 STATE = "state"
@@ -60,9 +61,7 @@ class OnnxAgent:
         shape = list(inputs[0].shape)
         sizes = range(MIN_VEHICLES, MAX_VEHICLES + 1)
         found = [size for size in sizes if shape[1:] in ([size, NUM_FEATURES], [size * NUM_FEATURES])]
-        self.metadata: dict[str, Any] = json.loads(
-            self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
-        )
+        self.metadata = _metadata(self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}"), path)
         self.has_memory = bool(self.metadata.get("memory"))
         if [item.name for item in inputs[1:]] != [STATE] * self.has_memory or not found:
             raise RapidError(
@@ -77,7 +76,7 @@ class OnnxAgent:
                 f"{len(ACTIONS)}), one for each of {', '.join(ACTIONS)}. Export it with that output."
             )
         self.flat = len(shape) == 2
-        self.name = name or Path(path).stem
+        self.name = printable(name or Path(path).stem)[:NAME_LENGTH]
 
     def __repr__(self) -> str:
         return f"<OnnxAgent '{self.name}': reads {self.vehicles} vehicles, {len(ACTIONS)} actions>"
@@ -117,9 +116,22 @@ class OnnxAgent:
         """Return the Q-values (B, A), float32.
 
         Raises:
-            RapidError: the observations have the wrong shape or are not finite, or a state is missing or too much.
+            RapidError: the observations have the wrong shape or are not finite, a state is missing or too much, or the
+            model fails, or returns something else than finite Q-values.
         """
-        return np.asarray(self.session.run([self.output], self.inputs(obs_BVF, state_BS))[0])
+        inputs = self.inputs(obs_BVF, state_BS)
+        try:
+            values_BA = np.asarray(self.session.run([self.output], inputs)[0])
+        except Exception as error:  # onnxruntime's errors share no base class that it exports.
+            raise RapidError(f"The ONNX model '{self.name}' fails: {sentence(str(error))} Export it again.") from error
+        expected = (len(obs_BVF), len(ACTIONS))
+        if values_BA.shape != expected or values_BA.dtype != np.float32 or not np.isfinite(values_BA).all():
+            raise RapidError(
+                f"The ONNX model '{self.name}' returned {values_BA.dtype} of shape {values_BA.shape}"
+                f"{'' if np.isfinite(np.asarray(values_BA, np.float64)).all() else ', not all finite'}; expected "
+                f"finite float32 of shape {expected}. Export it again."
+            )
+        return values_BA
 
     def inputs(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return what the model reads, by the names of its inputs.
@@ -135,6 +147,22 @@ class OnnxAgent:
                 "state beside the observations: agent.start(worlds) gives the first."
             )
         return values if state_BS is None else values | {STATE: np.ascontiguousarray(state_BS, np.float32)}
+
+
+def _metadata(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return what :func:`export_onnx` wrote into a model; nothing if somebody else made it.
+
+    Raises:
+        RapidError: it was edited or damaged.
+    """
+    try:
+        found = json.loads(text)
+        lanes = [found.get(key) for key in ("mirrored_lanes", "shielded_lanes", "lanes")]
+        if all(of is None or (type(of) is int and of > 0) for of in lanes) and (lanes[2] or not found.get("memory")):
+            return found
+    except (ValueError, AttributeError, RecursionError):
+        pass
+    raise RapidError(f"The ONNX model '{path}' has metadata that RAPID did not write. Export it again.")
 
 
 class Parity(NamedTuple):

@@ -2,30 +2,36 @@
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor
 
 from rapid import files
 from rapid.agents.shipped import agent_folder
+from rapid.bounds import numbers
 from rapid.config import NetworkConfig
 from rapid.config_io import apply_overrides
-from rapid.errors import RapidError
+from rapid.errors import RapidError, sentence
 from rapid.networks.encoding import feature_scale
 from rapid.networks.memory import initial_state, next_state
 from rapid.networks.q_network import Explanation, QNetwork, build_network
 from rapid.scenarios import ACTIONS, FEATURES, NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES
+from rapid.text import printable
 
 FORMAT = "rapid-agent"
 VERSION = 1
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "weights.safetensors"
+NAME_LENGTH = 100
+"""Characters of an agent's name that are shown."""
+_DTYPES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.bool: "BOOL"}
+"""What safetensors calls the types of weights."""
 
 
 class Agent(Protocol):
@@ -278,15 +284,64 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
             f"The agent '{folder}' is damaged: {CONFIG_FILE} has {config.get('vehicles')} vehicles, and a network that "
             f"reads {settings.vehicles}. Copy or train it again."
         )
+    _check_bounds(settings, folder)
+    _check_shapes(settings, lanes, folder)
     network = build_network(settings, lanes, seed=0)
     _load_weights(network, folder, config.get("weights_sha256"))
-    return QAgent(network.to(device).eval(), str(metadata.get("name") or folder.resolve().name), metadata)
+    name = printable(str(metadata.get("name") or folder.resolve().name))[:NAME_LENGTH]
+    return QAgent(network.to(device).eval(), name, metadata)
+
+
+def _check_bounds(settings: NetworkConfig, folder: Path) -> None:
+    """Raise RapidError if a number in the settings of a network is none that the program itself would take."""
+    for name, number, bounds in numbers(settings, "network."):
+        if bounds is not None and not bounds.hold(number):
+            raise RapidError(
+                f"The agent '{folder}' is damaged: in {CONFIG_FILE} {name} is {number}, but must be {bounds}. Copy or "
+                "train it again."
+            )
+
+
+def _check_shapes(settings: NetworkConfig, lanes: int, folder: Path) -> None:
+    """Raise RapidError unless the weights on disk are those of such a network, as far as their header tells.
+
+    Nothing of their size is allocated, neither of what the file names nor of what the settings ask for.
+    """
+    path = folder / WEIGHTS_FILE
+    if not path.is_file():
+        raise RapidError(f"The agent '{folder}' has no {WEIGHTS_FILE}. Copy the whole directory of the agent.")
+    try:
+        with safe_open(path, "pt") as stream:
+            slices = {key: stream.get_slice(key) for key in stream.keys()}  # noqa: SIM118
+            found = {key: (list(part.get_shape()), part.get_dtype()) for key, part in slices.items()}
+    except (SafetensorError, OSError) as error:
+        raise RapidError(f"The weights '{path}' cannot be read: {error}. Copy or train the agent again.") from error
+    parts = (settings.layers, settings.decoder_layers, settings.num_policies, len(settings.hidden))
+    # Every one of these has weights of its own: more of them than there are tensors cannot be.
+    fits = max(parts) <= len(found)
+    if fits:
+        try:
+            with torch.device("meta"):
+                expected = {key: (list(of.shape), _DTYPES[of.dtype]) for key, of in _empty(settings, lanes)}
+        except (RuntimeError, ValueError, TypeError, OverflowError, KeyError) as error:
+            raise RapidError(
+                f"The agent '{folder}' is damaged: no network can be made as its {CONFIG_FILE} says: "
+                f"{sentence(str(error).splitlines()[0])} Copy or train it again."
+            ) from error
+        fits = expected == found
+    if not fits:
+        raise RapidError(
+            f"The weights '{path}' do not fit the network in {CONFIG_FILE}: other names, shapes or types. Copy or "
+            "train the agent again."
+        )
+
+
+def _empty(settings: NetworkConfig, lanes: int) -> Iterable[tuple[str, Tensor]]:
+    return build_network(settings, lanes, seed=0).state_dict().items()
 
 
 def _load_weights(network: QNetwork, folder: Path, sha256: Any) -> None:
     path = folder / WEIGHTS_FILE
-    if not path.is_file():
-        raise RapidError(f"The agent '{folder}' has no {WEIGHTS_FILE}. Copy the whole directory of the agent.")
     try:
         weights = load_file(path)
     except (SafetensorError, OSError) as error:
@@ -300,3 +355,9 @@ def _load_weights(network: QNetwork, folder: Path, sha256: Any) -> None:
             f"The weights '{path}' do not fit the network in {CONFIG_FILE}: {str(error).splitlines()[-1].strip()} "
             "Copy or train the agent again."
         ) from error
+    wrong = [key for key, value in network.state_dict().items() if not bool(value.isfinite().all())]
+    if wrong:
+        raise RapidError(
+            f"The weights '{path}' are not all finite: {wrong[0]} holds NaN or infinity. The training went wrong or "
+            "the file was edited; train the agent again."
+        )

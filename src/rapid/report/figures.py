@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
+from matplotlib.text import Text
 
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.statistics import Estimate
@@ -128,7 +129,13 @@ def teachers_figure(summaries: Sequence[TeacherSummary]) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure atomically, in the format that the path's suffix names (png, svg)."""
+    """Write a figure atomically, in the format that the path's suffix names (png, svg).
+
+    Names in it are shown as they are: a `$` in the name of an agent begins no formula.
+    """
+    for text in figure.findobj(Text):
+        # Ticks of a logarithmic axis are formulas of matplotlib's own.
+        text.set_parse_math(text.get_text().startswith(r"$\mathdefault"))
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix.removeprefix("."), dpi=160, facecolor="white")
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -128,6 +129,13 @@ def to_record(decision: Decision) -> dict[str, Any]:
     return dataclasses.asdict(decision)
 
 
+def _is_of(value: Any, kind: Any) -> bool:
+    """Whether a value is of the kind of a field; of kinds other than text and numbers any is."""
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return kind not in (str, int) or type(value) is kind
+
+
 def from_record(record: dict[str, Any]) -> Decision:
     """Return the decision that :func:`to_record` took apart.
 
@@ -151,6 +159,9 @@ def from_record(record: dict[str, Any]) -> Decision:
         raise RapidError(f"A recorded decision has action {action!r}; expected 0 to 4 ({', '.join(ACTIONS)}).")
     if status not in STATUSES:
         raise RapidError(f"A recorded decision has status {status!r}; expected one of {', '.join(STATUSES)}.")
+    for field in dataclasses.fields(Decision):
+        if field.name in record and not _is_of(record[field.name], field.type):
+            raise RapidError(f"A recorded decision has {record[field.name]!r} as {field.name}, which it cannot be.")
     probabilities = record.get("probabilities")
     if probabilities is not None:
         probabilities = tuple(float(value) for value in probabilities)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
-from rapid.errors import RapidError
+from rapid.errors import RapidError, sentence
 from rapid.files import read_json, sha256
 from rapid.teacher.briefing import briefing
 from rapid.teacher.decision import Decision, from_record
@@ -117,11 +117,23 @@ def _read_lines(path: Path) -> Iterator[Decision]:
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         try:
             record = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RapidError(f"Line {number} of the recording '{path}' is not JSON: {error}.") from error
         if not isinstance(record, dict):
             raise RapidError(f"Line {number} of the recording '{path}' is not a JSON object.")
-        yield from_record(record)
+        yield _decision(record, f"Line {number} of the recording '{path}'")
+
+
+def _decision(record: dict[str, Any], where: str) -> Decision:
+    """Return a recorded decision.
+
+    Raises:
+        RapidError: it is none; the message says where.
+    """
+    try:
+        return from_record(record)
+    except (RapidError, TypeError, ValueError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise RapidError(f"{where} is no decision: {sentence(str(error))} Record it again.") from error
 
 
 def _read_parquet(path: Path) -> Iterator[Decision]:
@@ -144,4 +156,5 @@ def _read_parquet(path: Path) -> Iterator[Decision]:
     for row in table.to_pylist():
         if row["prompt_hash"]:
             record = {name: row[name] for name in _FIELDS if row.get(name) is not None}
-            yield from_record({**record, "probabilities": soft.get((row.get("episode"), row.get("step")))})
+            soft_A = soft.get((row.get("episode"), row.get("step")))
+            yield _decision({**record, "probabilities": soft_A}, f"A row of the recording '{path}'")
