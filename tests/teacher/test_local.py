@@ -1,6 +1,7 @@
 """The embedded model, on tiny random weights: unpacking GGUF, scoring words, batches, and the scoring teacher."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -347,3 +348,35 @@ def make_teacher_again(teacher, obs_BVF):
     """Decide with nothing remembered."""
     teacher._model.forget()
     return teacher.decide(obs_BVF, [None])[0]
+
+
+@pytest.mark.parametrize("damage", ["zeros", "missing", "shorter", "list", "earlier version"])
+def test_an_unpacked_model_that_changed_is_unpacked_again(gguf, tmp_path, monkeypatch, capsys, damage):
+    monkeypatch.setenv("RAPID_CACHE", str(tmp_path))
+    folder, digest, _ = models.dense_folder(str(gguf[0]))
+    capsys.readouterr()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert models.dense_folder(str(gguf[0])) == (folder, digest, "chatml")
+    assert not capsys.readouterr().err
+    weights = folder / "model.safetensors"
+    if damage == "zeros":
+        weights.write_bytes(before[weights.name][:-4000] + bytes(4000))
+    elif damage == "missing":
+        (folder / "tokenizer.json").unlink()
+    elif damage == "shorter":
+        weights.write_bytes(before[weights.name][:-1])
+    else:
+        (folder / "content.json").write_text("{") if damage == "list" else (folder / "content.json").unlink()
+    models.dense_folder(str(gguf[0]))
+    assert "It is unpacked again" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_what_a_killed_process_left_half_unpacked_goes(gguf, tmp_path):
+    old, new = tmp_path / ".tiny.old", tmp_path / ".tiny.new"
+    for path in (old, new):
+        path.mkdir()
+        (path / "model.safetensors").write_bytes(b"half")
+    os.utime(old, (0, 0))
+    convert(gguf[0], tmp_path / "tiny")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".tiny.new", "tiny"]

@@ -6,19 +6,25 @@ Families: Llama (SmolLM2 among them) and Qwen2, with their byte-level BPE tokeni
 """
 
 import json
+import os
 import shutil
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rapid.errors import RapidError
+from rapid.errors import DamagedError, RapidError
+from rapid.files import make_directory, read_json, sha256, sync_directory, write_json
 from rapid.progress import task
 
 FORMAT = 1
 """Raised when the conversion changes, so that older folders are made again."""
 
+CONTENT_FILE = "content.json"
+_ABANDONED = 86_400
+"""Seconds without a change after which nobody is at work in a temporary folder."""
 _FAMILIES = {"llama": "LlamaForCausalLM", "qwen2": "Qwen2ForCausalLM"}
 _LAYER_PARTS = {
     "attn_norm": "input_layernorm",
@@ -53,19 +59,51 @@ def convert(source: Path, folder: Path) -> None:
     except (OSError, ValueError, IndexError, KeyError, OverflowError, MemoryError) as error:
         # The reader trusts the file: one that is cut short or is something else fails in any of these ways.
         raise RapidError(f"'{source}' is not a whole GGUF file ({error}). Fetch it again.") from error
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    make_directory(folder.parent)
+    _remove_leftovers(folder)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         config = _config(fields, {tensor.name for tensor in reader.tensors}, source)
         (temporary / "config.json").write_text(json.dumps(config, indent=2))
         (temporary / "tokenizer.json").write_text(_tokenizer(fields, source))
         _write_tensors(reader.tensors, config, temporary / "model.safetensors", source)
+        facts: dict[str, Any] = {}
+        for path in sorted(temporary.iterdir()):
+            with path.open("rb") as stream:
+                os.fsync(stream.fileno())
+            facts[path.name] = {"bytes": path.stat().st_size, "sha256": sha256(path)}
+        write_json(temporary / CONTENT_FILE, {"files": facts}, sealed=True)
         # mkdtemp makes folders private; give this one the mode that mkdir() would have.
         temporary.chmod(0o755)
         shutil.rmtree(folder, ignore_errors=True)
         temporary.rename(folder)
+        sync_directory(folder.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def fault_of(folder: Path) -> str:
+    """Return what is wrong with an unpacked model, byte for byte; nothing if it is what :func:`convert` wrote."""
+    if not (folder / CONTENT_FILE).is_file():
+        return f"has no {CONTENT_FILE}, as folders of earlier versions"
+    try:
+        listed = read_json(folder / CONTENT_FILE, "list of an unpacked model")["files"]
+        for name, facts in listed.items():
+            path = folder / name
+            if not path.is_file():
+                return f"lacks {name}"
+            if path.stat().st_size != facts["bytes"] or sha256(path) != facts["sha256"]:
+                return f"has another {name} than was unpacked"
+    except (DamagedError, KeyError, TypeError, AttributeError):
+        return f"has a damaged {CONTENT_FILE}"
+    return ""
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what a process left half unpacked that was killed, but not what another may be at."""
+    for path in folder.parent.glob(f".{folder.name}.*"):
+        if time.time() - path.stat().st_mtime > _ABANDONED:
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _config(fields: dict[str, Any], tensors: set[str], source: Path) -> dict[str, Any]:

