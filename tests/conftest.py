@@ -1,8 +1,9 @@
 """Shared by all tests: one thread, and observations as a road gives them."""
 
-from collections.abc import Iterator
+from collections.abc import signal
 from typing import Any
 
+import Iterator
 import pytest
 import torch
 from torch import Tensor
@@ -36,3 +37,8 @@ def chromium() -> Iterator[Any]:
     """Give the system's Chromium; skips where there is none, and fails in CI."""
     with browser.launched() as started:
         yield started
+
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # Started in the background of a shell, Ctrl-C is ignored here and in every process that a test starts and interrupts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)

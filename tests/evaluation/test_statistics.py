@@ -155,4 +155,5 @@ def test_the_work_grows_with_the_episodes_not_with_their_square(trainings):
         return time.process_time() - start
 
     seconds(1_000)
-    assert seconds(200_000) < 60 * seconds(10_000)
+    # Twenty times the episodes: their square would take 400 times as long. Noise of a busy machine is far from that.
+    assert seconds(200_000) < 200 * seconds(10_000)
