@@ -40,5 +40,5 @@ def chromium() -> Iterator[Any]:
 
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # Started in the background of a shell, Ctrl-C is ignored here and in every process that a test starts and interrupts.
+    # Started in the background of a shell, Ctrl-C is ignored here and in every process that a test starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
