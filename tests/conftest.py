@@ -1,9 +1,9 @@
 """Shared by all tests: one thread, and observations as a road gives them."""
 
-from collections.abc import signal
+import signal
+from collections.abc import Iterator
 from typing import Any
 
-import Iterator
 import pytest
 import torch
 from torch import Tensor
