@@ -18,6 +18,13 @@ from rapid.progress import task
 COLLECT = ("collect", "--teacher.backend", "scripted", "--teacher.model", "rule", "--scenario", "lane-3-density-2")
 
 
+@pytest.fixture(autouse=True)
+def _usual_handler():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def start(*words: str, directory: Path) -> "subprocess.Popen[str]":
     """Start the command as a terminal does, in a group of its own; return once it notices signals."""
     process = subprocess.Popen(
@@ -27,6 +34,8 @@ def start(*words: str, directory: Path) -> "subprocess.Popen[str]":
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # Where the tests themselves run in the background, the shell has them ignore Ctrl-C, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
     while not _catches(process.pid, signal.SIGTERM):
@@ -152,7 +161,6 @@ def test_what_c_code_makes_of_an_interrupt_is_one(monkeypatch, capsys):
     monkeypatch.setattr(cli, "_call", swallow)
     with pytest.raises(SystemExit) as stop:
         cli.main(["run"])
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     assert stop.value.code == 130
     assert "interrupted" in capsys.readouterr().err
 
@@ -172,7 +180,6 @@ def test_an_interrupt_that_python_could_raise_nowhere_is_not_lost(monkeypatch, c
     monkeypatch.setattr(cli, "_call", lose)
     with pytest.raises(SystemExit) as stop:
         cli.main(["run"])
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     assert stop.value.code == 130
     assert "Exception ignored" not in capsys.readouterr().err
 
@@ -189,7 +196,6 @@ def test_an_interrupt_that_somebody_swallowed_comes_again(monkeypatch):
     monkeypatch.setattr(cli, "_call", swallow)
     with pytest.raises(SystemExit) as stop:
         cli.main(["run"])
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     assert stop.value.code == 130
 
 
