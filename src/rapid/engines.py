@@ -216,7 +216,7 @@ def _unpack(kind: str, value: Any) -> Any:
 def _need_ray() -> Any:
     try:
         ray = importlib.import_module("ray")
-        for part in ("ray.exceptions", "ray.util.queue"):
+        for part in ("ray.exceptions", "ray.util.queue", "ray.util.scheduling_strategies"):
             importlib.import_module(part)
     except ImportError as error:
         raise RapidError(
@@ -248,7 +248,11 @@ def _on_ray(
     running: dict[Any, int] = {}
     reports: Any = None
     try:
-        reports = ray.util.queue.Queue(actor_options={"num_cpus": 0})
+        # On this machine: a queue elsewhere would be lost with a machine that the jobs could do without.
+        here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
+            ray.get_runtime_context().get_node_id(), soft=False
+        )
+        reports = ray.util.queue.Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
         attempt = ray.remote(num_cpus=1, max_retries=_RETRIES)(_attempt)
         while waiting.fill() or running:
             while len(running) < workers and waiting.fill():

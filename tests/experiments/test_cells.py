@@ -74,3 +74,26 @@ def test_every_exhibit_says_what_it_needs_at_every_scale(name: str):
         for cell in cells_of(exhibit, recipe, "tiny"):
             assert title(cell)
     assert exhibit.caption.endswith((".", "in"))
+
+
+def test_everything_that_the_paper_shows_and_that_is_ours_has_an_id():
+    paper = {
+        "teacher-attack",
+        "ratio",
+        "offline",
+        "online",
+        "attack",
+        "routing",
+        "architecture",
+        "j-robust",
+        "beta",
+        "mixing-actions",
+        "prompt",
+        "efficiency",
+        "environment",
+        "hyperparameters",
+    }
+    assert set(ALL) == paper | {"floors", "teachers", "scores", "progress", "ablations", "robustness"}
+    for name in paper:
+        assert cells_of(ALL[name], "paper", "full") is not None
+        assert cells_of(ALL[name], "strong", "full") is not None

@@ -8,7 +8,8 @@ import pytest
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import tables
-from rapid.experiments.exhibits import ALL, Request
+from rapid.experiments.exhibit import Request
+from rapid.experiments.exhibits import ALL
 from rapid.experiments.figures import Curve, Lines, Point, Router, save
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
 from rapid.experiments.paper import PaperResult

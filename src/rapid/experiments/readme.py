@@ -13,7 +13,8 @@ import numpy as np
 
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import EpisodeRow, column
-from rapid.experiments.exhibits import ALL, Request, method_drives, rows_of
+from rapid.experiments.exhibit import Request, method_drives, rows_of
+from rapid.experiments.exhibits import ALL
 from rapid.experiments.figures import Lines, Router
 from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import Legacy

@@ -13,7 +13,8 @@ from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.summary import aligned
 from rapid.experiments import tables
 from rapid.experiments.cells import Cell, key
-from rapid.experiments.exhibits import ALL, Exhibit, Request, Shown, cells_of, recipe_of
+from rapid.experiments.exhibit import Exhibit, Request, Shown
+from rapid.experiments.exhibits import ALL, cells_of, recipe_of
 from rapid.experiments.figures import Lines, Router, save
 from rapid.experiments.graph import Outcome, plan, run
 from rapid.experiments.methods import EFFORTS

@@ -1,0 +1,151 @@
+"""What an exhibit is: a table or figure as the cells that it needs and how it is shown; and comparisons of methods."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rapid.evaluation.metrics import EpisodeRow
+from rapid.experiments import methods as make
+from rapid.experiments import words
+from rapid.experiments.cells import Adapt, Cell, Distill, Drive, Driver
+from rapid.experiments.figures import Lines, Router
+from rapid.experiments.methods import METHODS, Method, Setting
+from rapid.experiments.migrate import Legacy
+from rapid.experiments.paper import paper_result
+from rapid.experiments.store import Store
+from rapid.experiments.tables import Entry, Facts, Table, entry
+from rapid.scenarios import PAPER_SCENARIOS
+
+Shown = Table | Facts | Lines | Router
+
+
+ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
+
+
+@dataclass(frozen=True)
+class Request:
+    """Which version of an exhibit is wanted."""
+
+    recipe: str
+    scale: str
+
+    def setting(self, scenario: str, seed: int = 0) -> Setting:
+        """Return where a method is trained and measured."""
+        return Setting(self.recipe, self.scale, scenario, seed)
+
+    @property
+    def seeds(self) -> range:
+        """Training seeds."""
+        return range(make.EFFORTS[self.scale].seeds)
+
+    def attack(self, name: str) -> str:
+        """Return an attack's text: the recipe `paper` lets presence be attacked (docs/deviations.md)."""
+        return f"{name}:presence=free" if self.recipe == "paper" and name != "none" else name
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A table or figure with an id that never changes."""
+
+    id: str
+    caption: str
+    kind: Literal["table", "figure", "text"]
+    cells: Callable[[Request], list[Cell]]
+    """What must be computed."""
+    show: Callable[[Request, Store, "Exhibit"], list[Shown]]
+    recipes: tuple[str, ...] = ("paper", "strong")
+    of_paper: bool = True
+
+
+def drives(request: Request, agent: Distill | Adapt | Driver, scenario: str, attacks: Sequence[str]) -> list[Drive]:
+    """Return an agent's episodes under several attacks."""
+    effort = make.EFFORTS[request.scale]
+    slow = isinstance(agent, Driver) and (agent.teacher is not None or agent.name.startswith("planner"))
+    spawns = effort.reference_spawns if slow else effort.spawns
+    seed = 0 if isinstance(agent, Driver) else agent.seed
+    return [Drive(agent, scenario, request.attack(name), spawns, seed=seed) for name in attacks]
+
+
+def method_drives(request: Request, method: Method, scenario: str, attacks: Sequence[str]) -> list[Drive]:
+    """Return the episodes of a method's agents, one training for each seed."""
+    seeds = request.seeds if method.trained else range(1)
+    return [
+        drive
+        for seed in seeds
+        for drive in drives(request, method.agent(request.setting(scenario, seed)), scenario, attacks)
+    ]
+
+
+def rows_of(store: Store, cells: Sequence[Drive], legacy: Legacy | None = None) -> tuple[list[EpisodeRow], str]:
+    """Return the episodes of some cells and why any is missing; committed rows of before there were cells stand in."""
+    found: list[EpisodeRow] = []
+    missing = 0
+    for cell in cells:
+        if store.is_done(cell):
+            found += store.rows(cell)
+        else:
+            missing += 1
+    if missing and legacy and (old := store.legacy(legacy)):
+        return old, ""  # never mixed with new ones
+    return found, f"{missing} of {len(cells)} parts are missing" if missing else ""
+
+
+def grid(request: Request, store: Store, scenario: str, method: Method, attacks: Sequence[str]) -> tuple[Entry, ...]:
+    """Return one row of a table: a method in a scenario under each attack, beside the paper's numbers."""
+    entries: list[Entry] = []
+    for name in attacks:
+        applicable = method.trained or not method.looks or name in ("none", "uniform", "gaussian")
+        driven = name if method.looks else "none"
+        cells = method_drives(request, method, scenario, (driven,)) if applicable else []
+        old = Legacy(request.recipe, method.id, scenario, driven) if request.scale == "full" else None
+        rows, why = rows_of(store, cells, old)
+        said = paper_result("attack", name, scenario=scenario, method=method.printed) if method.printed else None
+        entries.append(entry(rows, said, why if applicable else "needs a network"))
+    return tuple(entries)
+
+
+def applicable(request: Request, ids: Sequence[str], scenarios: Sequence[str], attacks: Sequence[str]) -> list[Cell]:
+    found: list[Cell] = []
+    for scenario in scenarios:
+        for method in map(METHODS.__getitem__, ids):
+            usable = (
+                attacks if method.trained else [name for name in attacks if name in ("none", "uniform", "gaussian")]
+            )
+            usable = ["none"] if method.kind in ("teacher", "planner") or not method.looks else usable
+            found += method_drives(request, method, scenario, usable)
+    return found
+
+
+def comparison(
+    identity: str,
+    caption: str,
+    ids: tuple[str, ...],
+    scenarios: tuple[str, ...] = PAPER_SCENARIOS,
+    attacks: tuple[str, ...] = ATTACKS,
+    recipes: tuple[str, ...] = ("paper", "strong"),
+    of_paper: bool = False,
+) -> Exhibit:
+    """Return a table of methods under attacks, in several scenarios."""
+
+    def show(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]:
+        rows = tuple(
+            ((scenario, METHODS[name].label), grid(request, store, scenario, METHODS[name], attacks))
+            for scenario in scenarios
+            for name in ids
+        )
+        return [Table(identity, caption, ("scenario", "method"), attacks, rows, (words.sizes(request.recipe),))]
+
+    return Exhibit(
+        identity,
+        caption,
+        "table",
+        lambda request: applicable(request, ids, scenarios, attacks),
+        show,
+        recipes,
+        of_paper,
+    )
+
+
+def driven(store: Store, cells: Sequence[Drive]) -> Entry:
+    rows, why = rows_of(store, cells)
+    return entry(rows, failed=why)
