@@ -11,12 +11,13 @@ from rapid.registration import register_when_imported
 if TYPE_CHECKING:
     from rapid.agents.saved import load_agent as load_agent
     from rapid.data.dataset import load_dataset as load_dataset
+    from rapid.play.inline import watch as watch
     from rapid.simulator import make_env as make_env
     from rapid.simulator import make_sb3_vec as make_sb3_vec
     from rapid.simulator import make_vec as make_vec
 
 __version__ = "0.2.0"
-__all__ = ["__version__", "load_agent", "load_dataset", "make_env", "make_sb3_vec", "make_vec"]
+__all__ = ["__version__", "load_agent", "load_dataset", "make_env", "make_sb3_vec", "make_vec", "watch"]
 
 _HOME = {
     "load_agent": "rapid.agents.saved",
@@ -24,6 +25,7 @@ _HOME = {
     "make_env": "rapid.simulator",
     "make_sb3_vec": "rapid.simulator",
     "make_vec": "rapid.simulator",
+    "watch": "rapid.play.inline",
 }
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from rapid import files
 from rapid.agents.onnx_graph import build_model
 from rapid.agents.saved import NAME_LENGTH, QAgent, check_observations
+from rapid.agents.watchable import Watchable
 from rapid.errors import RapidError, how_to_install, sentence
 from rapid.networks.memory import initial_state, next_state
 from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, MIN_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
@@ -29,7 +30,7 @@ TOLERANCE = 1e-4
 """Largest difference allowed between the Q-values of the exported model and the network, relative to their size."""
 
 
-class OnnxAgent:
+class OnnxAgent(Watchable):
     """Drives greedily by an ONNX model, on one thread.
 
     Args:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from rapid import files
 from rapid.agents.shipped import agent_folder
+from rapid.agents.watchable import Watchable
 from rapid.bounds import numbers
 from rapid.config import NetworkConfig
 from rapid.config_io import apply_overrides
@@ -86,7 +87,7 @@ def remembered(agent: Any, action_T: Sequence[int] | np.ndarray) -> np.ndarray |
     return np.concatenate(states)
 
 
-class QAgent:
+class QAgent(Watchable):
     """Drives greedily by a Q-network; one with a memory is a :class:`RememberingAgent`.
 
     Args:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rapid.agents.open import kind_of
 from rapid.agents.saved import QAgent
+from rapid.agents.watchable import Watchable
 from rapid.evaluation.metrics import Kind
 from rapid.safety import IntervalFilter
 from rapid.scenarios import SLOWER
@@ -44,7 +45,7 @@ def shielded(agent: Any, box: str, lanes: int) -> Any:
     return ShieldedTeacher(agent, filter_, name)
 
 
-class _Shielded:
+class _Shielded(Watchable):
     """What all share; whatever else the agent has is found too."""
 
     def __init__(self, agent: Any, filter_: IntervalFilter, name: str) -> None:

@@ -4,7 +4,7 @@ const RATES = [0.5, 1, 2, 4];
 const MODES = [["routing", "colour: which policy"], ["attention", "colour: attention"], ["plain", "colour: plain"]];
 
 // `options`: names of the actions; more(pane), called when a pane's episode goes on and the clock nears what is known
-// of it; keys(event), which may take a key for itself; link(), the address of this moment.
+// of it; keys(event), which may take a key for itself; link(), the address of this moment, if it has one.
 function makePlayer(root, options) {
   const names = options.names, panes = [];
   const look = { mode: "routing", ghosts: true, masked: true, calm: matchMedia("(prefers-reduced-motion: reduce)").matches };

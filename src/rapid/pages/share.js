@@ -120,7 +120,7 @@ function addSharing(player, options) {
   player.root.append(
     element(
       "div", { class: "controls sharing", role: "group", "aria-label": "share this moment" },
-      button("Copy link", {}, making("link", copyLink)), button("PNG", {}, making("picture", picture)),
+      ...(options.link ? [button("Copy link", {}, making("link", copyLink))] : []), button("PNG", {}, making("picture", picture)),
       button("GIF", {}, making("GIF", gif)), button("Movie", {}, making("movie", movie)), span, note,
     ),
   );

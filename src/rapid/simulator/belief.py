@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid.agents.watchable import Watchable
 from rapid.errors import RapidError
 from rapid.scenarios import FEATURES, NUM_FEATURES, NUM_VEHICLES, Scenario, get_scenario
 from rapid.simulator.compile import kernel
@@ -155,7 +156,7 @@ def search_belief(cars, tags, world, tries, settings, width, depth, caution, cra
         found[action] = best
 
 
-class ObservationPlanner:
+class ObservationPlanner(Watchable):
     """Drives by the observation alone, by plans that do well in the mean of worlds drawn at random around it.
 
     A yardstick for policies, which see the same: it has the simulator as its model, and takes some hundredths of a
@@ -213,7 +214,7 @@ class ObservationPlanner:
         return actions
 
 
-class CarsPlanner:
+class CarsPlanner(Watchable):
     """Knows where every car within `REACH` is, how fast, and which lane it heads for; what its driver wants is drawn.
 
     It stands between :class:`ObservationPlanner` and the planner of :mod:`rapid.simulator.search`, but does not differ

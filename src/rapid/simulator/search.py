@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid.agents.watchable import Watchable
 from rapid.errors import RapidError
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from rapid.simulator.behavior import command_ego
@@ -283,7 +284,7 @@ def unavoidable(env: Any, depth: int) -> NDArray[np.bool_]:
     return doomed
 
 
-class PlannerAgent:
+class PlannerAgent(Watchable):
     """Drives with perfect knowledge: it reads the simulator's true state and plans with the simulator itself.
 
     A reference for tables, neither a bound nor a policy: no observation enters. Give it to

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid.agents.watchable import Watchable
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import Kind
 from rapid.files import read_json
@@ -25,7 +26,7 @@ from rapid.teacher.scene import Scene, read_scenes
 _CONSTANTS = {"idle": IDLE, "slower": SLOWER, "faster": FASTER}
 
 
-class Scripted:
+class Scripted(Watchable):
     """A driver without a model.
 
     Args:
