@@ -70,7 +70,8 @@ def test_what_cannot_be_made_is_said(saved: Path):
 def test_a_cell_plays_it_in_a_frame_that_reaches_nothing(chromium: Any, saved: Path, tmp_path: Path):
     agent = rapid.load_agent(saved)
     agent.name = "<img src=x onerror=alert(1)>\"'"
-    html = agent.watch(seed=900_003, attack="fgsm", beside="slower")._repr_html_()
+    watched = agent.watch(seed=900_003, attack="fgsm", beside="slower")
+    html = watched._repr_html_()  # pyright: ignore[reportPrivateUsage]
     cell = tmp_path / "cell.html"
     cell.write_text(f"<!doctype html><meta charset=utf-8><body>{html}", encoding="utf-8")
     with tab(chromium, viewport={"width": 1000, "height": 900}, accept_downloads=True) as shown:

@@ -94,7 +94,7 @@ def _episode(agent: Any, scenario: str, seed: int, attack: str) -> dict[str, Any
     check_road(agent, scenario)
     radius = 0.0 if attack == "none" else min(parse_attack(attack).radius, 0.49)
     ride = Ride(agent, scenario, seed)
-    episode = ride.opening() | {"attack": attack}
+    episode: dict[str, Any] = ride.opening() | {"attack": attack}
     while not ride.ended:
         for name, value in ride.step(attack=attack, radius=radius)["added"].items():
             episode[name].append(value)
