@@ -1,5 +1,6 @@
 """Where verbs put what they make: nothing of anybody else's is replaced, and what differs is said."""
 
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -148,6 +149,18 @@ def test_evaluate_without_agents_leaves_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("evaluate") == 2
     assert not list(tmp_path.iterdir())
+
+
+def test_evaluate_without_a_place_prints_its_table_and_keeps_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    for seed in "01":
+        assert run(*EVALUATE, seed) == 0
+        said = capsys.readouterr().out
+        assert "slower" in said
+        assert said.endswith("Nothing was kept; --out DIRECTORY keeps rows and plot.\n")
+        assert not list(tmp_path.iterdir())
 
 
 def test_an_exported_file_is_not_replaced(tmp_path, monkeypatch, capsys):

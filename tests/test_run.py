@@ -193,6 +193,41 @@ def test_other_settings_and_unknown_steps_are_refused(config: Config, finished: 
         run(config, finished, "mxi", say=lambda line: None)
 
 
+@pytest.mark.parametrize("damaged", [False, True])
+def test_force_begins_anew_and_removes_only_what_a_run_makes(config: Config, tmp_path: Path, monkeypatch, damaged: bool):
+    # As far as the mixture: no step after it is of interest here.
+    monkeypatch.setattr("rapid.run.distill_agent", lambda *given: (_ for _ in ()).throw(RapidError("Enough.")))
+    home, other = tmp_path / "run", apply_overrides(config, {"seed": 1})
+
+    def begin(config: Config, **options) -> str:
+        with pytest.raises(RapidError) as told:
+            run(config, home, say=lambda line: None, **options)
+        return str(told.value)
+
+    assert begin(config) == "Enough."
+    before = artefacts(home)
+    if damaged:
+        (home / "run.json").write_text("{")
+    assert ("damaged" if damaged else "seed: 0 there, 1 now") in begin(other)
+    (home / "thesis.tex").write_text("mine")
+    assert "thesis.tex" in begin(other, force=True)
+    assert artefacts(home) == before
+    (home / "thesis.tex").unlink()
+    inside = apply_overrides(other, {"data": str(home / "collect")})
+    assert "is read by this command" in begin(inside, force=True)
+    assert artefacts(home) == before
+    assert begin(other, force=True) == "Enough."
+    assert artefacts(home).keys() == before.keys()
+    assert artefacts(home) != before
+    assert json.loads((home / "run.json").read_text())["config"]["seed"] == 1
+    # A directory that is no run's is never emptied.
+    for path in (home / "run.json", home / "config.toml"):
+        path.unlink()
+    before = artefacts(home)
+    assert "not the directory of a run" in begin(config, force=True)
+    assert artefacts(home) == before
+
+
 @pytest.mark.slow
 def test_a_killed_run_ends_as_an_uninterrupted_one(config: Config, finished: Path, tmp_path: Path):
     words = [sys.executable, "-m", "rapid.cli", "run", "--config", str(finished / "config.toml")]

@@ -60,6 +60,8 @@ class Run:
     """Where the run lives; by default runs/SCENARIO-RECIPE-SCALE-seedN, with a hash of other settings behind it."""
     restart: Annotated[str, arg(name="from", metavar="STEP")] = ""
     """Redo this step and all later ones: collect, mix, distill, adapt, evaluate or report."""
+    force: bool = False
+    """Begin anew where a run with other settings is, and remove what that made."""
 
 
 @dataclass(frozen=True)
@@ -185,8 +187,8 @@ class Evaluate:
     simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
     """The compiled twin, or highway-env itself."""
     out: str = ""
-    """Directory of the episodes, the table and the plot; by default evaluation, or evaluation-HASH
-    beside it if another command made that."""
+    """Directory of the episodes, the table and the plot, where the same command goes on after an interruption; without
+    it the table is printed and nothing is kept."""
     force: bool = False
     """Replace what another command made in the place of the output."""
     seed: Seed = Config.seed

@@ -25,6 +25,8 @@ _RECORD = ("metrics.jsonl", "checkpoint*.safetensors", "tracking-*", "tensorboar
 TRAINING = ("agent", "seed-*", "together", "ppo", *_RECORD)
 EVALUATION = ("parts", "episodes.parquet", "summary.*", "worst.*", "*.png", "*.svg", "adversar*", "sweep.*")
 
+RUN = ("run.json", "config.toml", "steps", "collect", "mix", "distill", "adapt", "evaluate", "figures", "report.html")
+
 
 class ClashError(RapidError):
     """A place is taken by something else."""
@@ -94,7 +96,7 @@ def clear(place: Path, makes: Sequence[str], keep: Iterable[Path] = ()) -> None:
             "--out."
         )
     # The record first: a kill in between leaves nothing that looks whole.
-    for name in sorted(_entries(place), key=lambda name: name not in (REQUEST_FILE, "dataset.json")):
+    for name in sorted(_entries(place), key=lambda name: name not in (REQUEST_FILE, "run.json", "dataset.json")):
         path = place / name
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 

@@ -15,6 +15,7 @@ from rapid.data.shipped import SHIPPED
 from rapid.errors import RapidError, did_you_mean
 from rapid.locks import exclusive
 from rapid.networks.q_network import check_widening
+from rapid.outputs import RUN, clear
 from rapid.phases.adapt import ONLINE, adapt_agent, learn_online
 from rapid.phases.checks import check
 from rapid.phases.data import collect_transitions, data_folders, given_data, mix_datasets
@@ -23,12 +24,14 @@ from rapid.phases.measure import FLOORS, PLANNER, TEACHER, floors_under_attack, 
 from rapid.phases.page import write_run_report
 from rapid.presets import offline_baseline, online_baseline
 from rapid.progress import format_seconds
-from rapid.runs import STEPS, RunDirectory, commit
+from rapid.runs import MANIFEST, STEPS, RunDirectory, commit
 from rapid.scenarios import get_scenario
 from rapid.simulator import make_vec
 
 
-def run(config: Config, directory: Path, restart: str = "", say: Callable[[str], None] = print) -> Path:
+def run(
+    config: Config, directory: Path, restart: str = "", say: Callable[[str], None] = print, *, force: bool = False
+) -> Path:
     """Do every step that is not done yet and return the path of the report.
 
     Args:
@@ -36,6 +39,7 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
         directory: where the run lives; made, or gone on with.
         restart: a step to redo, with all later ones; empty to redo none.
         say: receives a line at a time.
+        force: remove what a run with other settings made in the directory, and nothing else.
 
     Raises:
         RapidError: anything about the input or the surroundings that keeps the run from its end.
@@ -48,7 +52,15 @@ def run(config: Config, directory: Path, restart: str = "", say: Callable[[str],
         raise RapidError(f"Unknown step '{restart}'{did_you_mean(restart, STEPS)} Steps: {', '.join(STEPS)}.")
     # Before the first look at it: of two runs with other settings the second must see what the first is.
     with exclusive(directory):
-        return _run_steps(config, RunDirectory(directory, config, STEPS), restart, say)
+        try:
+            home = RunDirectory(directory, config, STEPS)
+        except RapidError:
+            if not (force and (directory / MANIFEST).exists()):
+                raise
+            read = (config.data, config.teacher.memory, config.teacher.replay_file)
+            clear(directory, RUN, [Path(path) for path in read if path not in ("", SHIPPED)])
+            home = RunDirectory(directory, config, STEPS)
+        return _run_steps(config, home, restart, say)
 
 
 def _run_steps(config: Config, home: RunDirectory, restart: str, say: Callable[[str], None]) -> Path:

@@ -27,6 +27,7 @@ from rapid.presets import of_file, without_presets
 from rapid.progress import warn
 
 FORMAT = 1
+MANIFEST = "run.json"
 STEPS = ("collect", "mix", "distill", "adapt", "evaluate", "report")
 """The steps of a run, in their order."""
 _PACKAGES = (
@@ -81,7 +82,7 @@ class RunDirectory:
     def __init__(self, path: str | os.PathLike[str], config: Config, steps: Sequence[str]) -> None:
         self.path = Path(path)
         self.steps = tuple(steps)
-        manifest = self.path / "run.json"
+        manifest = self.path / MANIFEST
         if manifest.exists():
             self._check_same(read_json(manifest, "run manifest"), config)
         elif self.path.exists() and (not self.path.is_dir() or not is_empty(self.path)):
@@ -110,21 +111,21 @@ class RunDirectory:
             or not isinstance(manifest.get("config"), dict)
         ):
             raise RapidError(
-                f"'{self.path / 'run.json'}' is not a run manifest of format {FORMAT}. It is damaged or was made by "
-                "another version; choose another --directory."
+                f"'{self.path / MANIFEST}' is not a run manifest of format {FORMAT}. It is damaged or was made by "
+                "another version; choose another --directory, or replace what is there with --force."
             )
         made = manifest["config"]
         # A setting that did not exist when the run was made had the effect that its default has now.
         base = of_file(made)
         # There was no PPO before a run's settings told of it.
         base = replace(base, adapt=replace(base.adapt, ppo=PpoConfig()))
-        there = apply_overrides(base, without_presets(made), source=f"'{self.path / 'run.json'}'")
+        there = apply_overrides(base, without_presets(made), source=f"'{self.path / MANIFEST}'")
         changes = differences(to_dict(without_place(there)), to_dict(without_place(config)))
         if changes:
             raise RapidError(
                 f"The run in '{self.path}' was made with other settings: {changes}. Nothing was changed. Repeat "
-                f"its own settings (rapid run --config {self.path / 'config.toml'} --directory {self.path}), or choose "
-                "another --directory."
+                f"its own settings (rapid run --config {self.path / 'config.toml'} --directory {self.path}), choose "
+                "another --directory, or replace what is there with --force."
             )
 
     def is_done(self, step: str) -> bool:

@@ -82,7 +82,7 @@ def _run(options: Run, config: Config) -> int:
         # Any other setting gets a directory of its own, so that it does not meet the run without it.
         differing = json.dumps(to_dict(without_place(config)), sort_keys=True)
         name += f"-{hashlib.sha256(differing.encode()).hexdigest()[:8]}"
-    run(config, Path(options.directory or f"runs/{name}"), options.restart)
+    run(config, Path(options.directory or f"runs/{name}"), options.restart, force=options.force)
     return 0
 
 

@@ -1,7 +1,9 @@
 """Measuring on disk: agents over the test spawns, each driven once, with table and plot."""
 
 import hashlib
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from rapid.evaluation.summary import summary_text
 from rapid.evaluation.worst import worst_text
 from rapid.files import sha256, write_text
 from rapid.networks.q_network import QNetwork
-from rapid.outputs import EVALUATION, claimed, place_for
+from rapid.outputs import EVALUATION, claimed
 from rapid.phases.checks import check
 from rapid.phases.data import given_data
 from rapid.progress import task, warn
@@ -64,7 +66,7 @@ def compare(
     Args:
         config: where and how they drive.
         specs: the agents.
-        out: the directory; empty is ``evaluation``, or one beside it if that holds another comparison.
+        out: the directory; empty is none: the table is said and nothing is kept.
         force: replace another comparison there.
         say: is given the table, and where all of it is.
     """
@@ -88,17 +90,19 @@ def compare(
         "seed": config.seed,
         "evaluate": {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()},
     }
-    place = Path(out) if out else place_for("evaluation", request)
-    with claimed(place, request, EVALUATION, force=force, keep=map(Path, specs)):
+    with ExitStack() as held:
+        place = Path(out or held.enter_context(tempfile.TemporaryDirectory(prefix="rapid-")))
+        held.enter_context(claimed(place, request, EVALUATION, force=force, keep=map(Path, specs)))
         if set(specs).isdisjoint(FLOORS) and any(text.partition(":")[0] in PRESETS for text in config.evaluate.attacks):
             floors = floors_under_attack(config.scenario)
             opened |= {spec: _open(config, spec, config.scenario) for spec in floors}
             specs = [*specs, *floors]
         rows = measure(config, config.scenario, specs, place, labels, opened)
-        write_figures(ReportData(title=f"{config.scenario}", rows=rows), place)
+        if out:
+            write_figures(ReportData(title=f"{config.scenario}", rows=rows), place)
         if say:
             say((place / "summary.txt").read_text(encoding="utf-8"))
-            say(f"Rows, table and plot: {place}")
+            say(f"Rows, table and plot: {place}" if out else "Nothing was kept; --out DIRECTORY keeps rows and plot.")
     return rows
 
 
