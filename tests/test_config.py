@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+import math
 import re
 import shlex
 import tomllib
@@ -13,8 +14,8 @@ from hypothesis import strategies as st
 from rapid import config as settings
 from rapid import presets
 from rapid.bounds import Bounds, numbers
-from rapid.config import Config
-from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate
+from rapid.config import Config, NetworkConfig
+from rapid.config_io import apply_overrides, load_toml, to_dict, to_toml, validate, weights_about
 from rapid.errors import RapidError
 from rapid.options import Run
 from rapid.parsing import base_settings, parse
@@ -265,6 +266,72 @@ def test_every_number_has_bounds_and_the_defaults_lie_within():
             if kind.__dataclass_fields__[name].default_factory is dataclasses.MISSING  # no default at all
         ]
         assert bare(kind(**dict.fromkeys(required, ""))) == [], kind
+
+
+# What takes time but no memory, or counts something that is not held.
+ENDLESS = {
+    *("iterations", "steps", "adversary_steps", "evaluate_every", "learning_starts", "critic_steps", "epochs"),
+    *("exploration_hold", "target_update", "max_tokens", "max_decisions", "max_retries"),
+}
+
+
+def test_every_size_that_takes_memory_has_an_upper_bound():
+    from rapid.verbs import VERBS
+
+    trees: list[Any] = [Config()]
+    for kind, _, _ in VERBS.values():
+        given = {
+            item.name: ""
+            for item in dataclasses.fields(kind)
+            if item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING
+        }
+        trees.append(kind(**given))
+    bare = {
+        f"{type(tree).__name__}: {name}"
+        for tree in trees
+        for name, number, bounds in numbers(tree)
+        if isinstance(number, int) and (bounds is None or math.isinf(bounds.high))
+        if name.rpartition(".")[2] not in ENDLESS
+    }
+    assert bare == {"VerifySimulator: episodes"}  # driven one after another
+
+
+@pytest.mark.parametrize("name", sorted({name for name, _, _ in numbers(Config())}))
+def test_every_size_beyond_its_upper_bound_is_refused_by_name(name: str):
+    bounds = next(bounds for each, _, bounds in numbers(Config()) if each == name)
+    assert bounds is not None
+    if math.isinf(bounds.high):
+        return
+    *path, last = name.split(".")
+    kind = type(getattr(functools.reduce(getattr, path, Config()), last))
+    above: Any = (int(bounds.high) + 1,) if kind is tuple else kind(bounds.high + 1)
+    overrides: Any = functools.reduce(lambda found, key: {key: found}, reversed(path), {last: above})
+    with pytest.raises(RapidError, match=f"'{re.escape(name)}'"):
+        validate(apply_overrides(Config(), overrides))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        ({"network": {"width": 16384}}, "network.width"),
+        ({"network": {"num_policies": 200, "layers": 100, "width": 512, "heads": 8}}, "network.width"),
+        ({"network": {"kind": "mlp", "hidden": [16384, 16384]}}, "network.hidden"),
+        ({"network": {"kind": "mlp-mixture", "hidden": [4096] * 5, "num_policies": 2}}, "network.hidden"),
+        ({"adapt": {"ppo": {"rollout": 100_000, "num_envs": 1000}}}, "adapt.ppo.rollout"),
+    ],
+)
+def test_sizes_that_multiply_are_refused_before_anything_is_allocated(overrides: dict[str, Any], name: str):
+    with pytest.raises(RapidError, match=f"'{re.escape(name)}'"):
+        validate(apply_overrides(Config(), overrides))
+
+
+@pytest.mark.parametrize("kind", ["rapid", "attentive", "mlp", "mlp-mixture"])
+def test_weights_are_counted_about_right(kind: str):
+    from rapid.networks.q_network import QNetwork
+
+    network = NetworkConfig(kind=kind, width=128, heads=4, layers=3, feedforward=256, num_policies=3)
+    made = sum(weight.numel() for weight in QNetwork(network, lanes=3).parameters())
+    assert 0.8 < weights_about(network) / made < 1.2
 
 
 @pytest.mark.parametrize("name", sorted({name for name, _, _ in numbers(Config())}))

@@ -194,7 +194,9 @@ def test_other_settings_and_unknown_steps_are_refused(config: Config, finished: 
 
 
 @pytest.mark.parametrize("damaged", [False, True])
-def test_force_begins_anew_and_removes_only_what_a_run_makes(config: Config, tmp_path: Path, monkeypatch, damaged: bool):
+def test_force_begins_anew_and_removes_only_what_a_run_makes(
+    config: Config, tmp_path: Path, monkeypatch, damaged: bool
+):
     # As far as the mixture: no step after it is of interest here.
     monkeypatch.setattr("rapid.run.distill_agent", lambda *given: (_ for _ in ()).throw(RapidError("Enough.")))
     home, other = tmp_path / "run", apply_overrides(config, {"seed": 1})

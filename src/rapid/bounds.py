@@ -41,6 +41,20 @@ Count = Annotated[int, Bounds(0)]
 """How many; perhaps none."""
 Positive = Annotated[int, Bounds(1)]
 """How many; at least one."""
+Width = Annotated[int, Bounds(1, 16_384)]
+"""Numbers in a row of a network."""
+Depth = Annotated[int, Bounds(1, 256)]
+"""Layers or other parts of a network."""
+Side = Annotated[int, Bounds(1, 100_000)]
+"""How many are under way side by side in this process, each with memory of its own."""
+SideOrNone = Annotated[int, Bounds(0, 100_000)]
+"""The same; perhaps none."""
+Rows = Annotated[int, Bounds(1, 10_000_000)]
+"""Transitions that are held in memory, at about 600 bytes each."""
+RowsOrNone = Annotated[int, Bounds(0, 10_000_000)]
+"""The same; perhaps none."""
+Workers = Annotated[int, Bounds(1, 1000)]
+"""Processes or threads."""
 Amount = Annotated[float, Bounds(0)]
 """How much; perhaps nothing."""
 AboveZero = Annotated[float, Bounds(0, open_low=True)]

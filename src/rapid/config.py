@@ -10,7 +10,24 @@ import typing
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from rapid.bounds import AboveZero, Amount, Bounds, Count, Positive, Seed, Share, ShareAboveZero, ShareBelowOne
+from rapid.bounds import (
+    AboveZero,
+    Amount,
+    Bounds,
+    Count,
+    Depth,
+    Positive,
+    Rows,
+    RowsOrNone,
+    Seed,
+    Share,
+    ShareAboveZero,
+    ShareBelowOne,
+    Side,
+    SideOrNone,
+    Width,
+    Workers,
+)
 from rapid.scenarios import MAX_VEHICLES, MIN_VEHICLES, NUM_VEHICLES
 
 Recipe = Literal["paper", "strong"]
@@ -42,7 +59,7 @@ class TeacherConfig:
     """Environment variable that holds the key; the key itself is never written anywhere."""
     headers_env: str = ""
     """Environment variable that holds further headers, one a line as ``Name: value``; kept as secret as the key."""
-    concurrency: Positive = 8
+    concurrency: Workers = 8
     """Requests in flight at once (`endpoint`)."""
     requests_per_minute: Amount = 0.0
     """Upper bound on requests per minute; 0 is no bound (`endpoint`)."""
@@ -52,11 +69,11 @@ class TeacherConfig:
     """Tries after the first for a failed request, with backoff (`endpoint`)."""
     tool_calling: Literal["auto", "native", "text"] = "auto"
     """How tools are called (`react`, `endpoint`): the server's own way, plain text, or the former until it refuses."""
-    max_answer_tokens: Positive = 400
+    max_answer_tokens: Annotated[int, Bounds(1, 100_000)] = 400
     """Tokens that one answer may have."""
     shuffle_facts: bool = False
     """Control: tell the facts of one action about another (`local`, `digest`), to see whether the model uses them."""
-    max_turns: Positive = 8
+    max_turns: Annotated[int, Bounds(1, 1000)] = 8
     """Tool calls allowed before a decision must be made (`react`)."""
     max_fallback_share: Share = 0.2
     """Share of decisions that a rule may make because the model gave no usable answer; above it, collecting stops. 1
@@ -70,7 +87,7 @@ class TeacherConfig:
     memory: str = ""
     """File of past situations that the model is reminded of, such as the `memory.jsonl` of a dataset; it is only read.
     With this or `reflect`, a `local` model in `digest` style answers in words instead of scoring them."""
-    few_shot: Count = 0
+    few_shot: Annotated[int, Bounds(0, 1000)] = 0
     """How many of the most similar past situations the model is shown at each decision; 0 is none."""
     reflect: bool = False
     """Remember each episode: its tightest moment, or after a crash what went wrong, which the model is asked. Written
@@ -81,11 +98,11 @@ class TeacherConfig:
 class CollectConfig:
     """Phase 1: how much is collected (paper: section 4.2)."""
 
-    teacher_transitions: Count = 15_000
+    teacher_transitions: RowsOrNone = 15_000
     """Transitions that the teacher drives; whole episodes are collected until there are at least as many."""
-    random_transitions: Count = 15_000
+    random_transitions: RowsOrNone = 15_000
     """Transitions of the uniformly random driver."""
-    lockstep: Positive = 16
+    lockstep: Side = 16
     """Episodes driven side by side, so that the model sees a batch of prompts; a `local` model that converses answers
     all of them together."""
     max_tokens: Count = 0
@@ -101,7 +118,7 @@ class CollectConfig:
     engine: Literal["local", "ray"] = "local"
     """Where workers run: on this machine, or on a Ray cluster (RAY_ADDRESS; every machine needs the same RAPID, and the
     API key, if any, in the environment that its `ray start` was given)."""
-    workers: Annotated[int, Bounds(1, 1000)] = 1
+    workers: Workers = 1
     """Parts of the collection that are under way at once, each with a teacher of its own."""
     shards: Annotated[int, Bounds(0, 1000)] = 0
     """Into how many parts the collection is divided, which decides what is collected; 0 is one for each worker, or as
@@ -114,7 +131,7 @@ class MixConfig:
 
     p: Share = 0.5
     """Share of teacher transitions; the paper's best is 0.25, of 15,000."""
-    size: Positive = 30_000
+    size: Rows = 30_000
     """Number of transitions in the mixture."""
     level: Literal["transition", "batch"] = "transition"
     """`transition` draws the mixture once; `batch` keeps up to `size` of each source and mixes in every batch."""
@@ -129,21 +146,21 @@ class NetworkConfig:
     kind: Literal["rapid", "attentive", "mlp", "mlp-mixture"] = "rapid"
     """`rapid` is the mixture of policies, `attentive` its single policy, `mlp` the baselines' 2x256 network,
     `mlp-mixture` the remark's mixture of the *actions* of MLPs."""
-    num_policies: Positive = 2
+    num_policies: Depth = 2
     """N: policy 1 is distilled from the teacher, policies 2..N are online adapters."""
-    top_k: Positive = 2
+    top_k: Depth = 2
     """K: policies that are active for a vehicle; policy 1 always is, the others compete for K-1 places."""
-    width: Positive = 32
+    width: Width = 32
     """D: width of a token."""
-    heads: Positive = 1
+    heads: Depth = 1
     """Attention heads."""
-    layers: Positive = 1
+    layers: Depth = 1
     """L: transformer layers of a policy."""
-    decoder_layers: Positive = 1
+    decoder_layers: Depth = 1
     """Transformer layers of the decoder; of its last only the token that is read is computed."""
-    feedforward: Positive = 64
+    feedforward: Width = 64
     """Width of the feed-forward layers."""
-    hidden: tuple[Positive, ...] = (256, 256)
+    hidden: tuple[Width, ...] = (256, 256)
     """Hidden layers of the MLPs."""
     input: Literal["raw", "normalized", "ego", "near"] = "near"
     """What the network reads: the features as they are, scaled to +-1 by highway-env's own ranges, or
@@ -196,7 +213,7 @@ class LossConfig:
 
     discount: Share = 0.9
     """gamma"""
-    n_step: Positive = 1
+    n_step: Annotated[int, Bounds(1, 1000)] = 1
     """Rewards summed before bootstrapping; never across the end of an episode."""
     double: bool = True
     """Double DQN: the online network chooses the next action, the target network values it."""
@@ -236,7 +253,7 @@ class OptimizerConfig:
     """By what the step size of the zero gate is multiplied. A gate that stays small keeps the adapters out."""
     linear_decay: bool = True
     """Let the step size fall linearly to zero over the training."""
-    batch_size: Positive = 64
+    batch_size: Annotated[int, Bounds(1, 1_000_000)] = 64
     """Transitions in a batch."""
     target_update: Positive = 1
     """Gradient steps between two updates of the target network."""
@@ -266,13 +283,13 @@ class PpoConfig:
 
     steps: Count = 0
     """Environment steps after those of Q-learning, in whole rollouts; 0 leaves this part out."""
-    num_envs: Positive = 128
+    num_envs: Side = 128
     """Worlds stepped at once."""
-    rollout: Positive = 30
+    rollout: Annotated[int, Bounds(1, 100_000)] = 30
     """Steps of every world between two updates of the policy; 30 is an episode."""
     epochs: Positive = 4
     """Passes over each rollout."""
-    batch_size: Annotated[int, Bounds(2)] = 512
+    batch_size: Annotated[int, Bounds(2, 1_000_000)] = 512
     """Transitions in a minibatch."""
     temperature: AboveZero = 0.1
     """T of the policy that drives, softmax(Q / T); the greedy policy is what is measured."""
@@ -343,13 +360,13 @@ class AdaptConfig:
 
     steps: Count = 10_000
     """Environment steps of Q-learning, all worlds together; 0 leaves it out."""
-    num_envs: Positive = 10
+    num_envs: Side = 10
     """Worlds stepped at once; 1 is the paper's setting."""
     updates_per_step: AboveZero = 0.2
     """Gradient steps per environment step."""
     scenario: str = ""
     """Target scenario; empty is the one that the agent was distilled in."""
-    buffer_size: Positive = 100_000
+    buffer_size: Rows = 100_000
     """Capacity of the replay buffer."""
     learning_starts: Count = 500
     """Environment steps before the first gradient step."""
@@ -395,13 +412,13 @@ class AdaptConfig:
 class EvaluateConfig:
     """Measuring: spawns and attacks (paper: section 4.5)."""
 
-    spawns: Positive = 200
+    spawns: Side = 200
     """Episodes, one for each of the first spawn seeds of the set `test`."""
-    teacher_spawns: Count = 16
+    teacher_spawns: SideOrNone = 16
     """Episodes of the teacher, which is slow; the first of the same seeds. 0 leaves the row out."""
-    planner_spawns: Count = 200
+    planner_spawns: SideOrNone = 200
     """Episodes of a planner, which takes seconds for each; the first of the same seeds. 0: a run has no such row."""
-    curve_spawns: Count = 20
+    curve_spawns: SideOrNone = 20
     """Episodes of each point of a learning curve, from the set `tune`."""
     attacks: tuple[str, ...] = ("none", "uniform", "gaussian", "fgsm", "pgd")
     """Attacks on the observations, as texts such as pgd:steps=50,radius=0.02 (docs/attacks.md), and presets of them:
@@ -410,7 +427,7 @@ class EvaluateConfig:
     """The same for the teacher: noise, lies and transfer can be made on it."""
     adversary_steps: Positive = 40_000
     """Decisions that an adversary is trained for, where the attack `adversary` names none."""
-    workers: Positive = 1
+    workers: Workers = 1
     """Processes among which the attacks on an agent are divided; the results are the same."""
 
 
@@ -434,7 +451,7 @@ class Config:
     else is a directory that holds the datasets `teacher` and `random`."""
     seed: Seed = 0
     """The seed from which every random stream is derived."""
-    threads: Positive = 1
+    threads: Workers = 1
     """Torch threads of this process; scale by processes instead. Another number gives other weights, in their last bits
     at first."""
     device: str = "cpu"

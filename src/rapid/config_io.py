@@ -8,16 +8,22 @@ import types
 import typing
 from collections.abc import Iterator
 from functools import reduce
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from rapid.bounds import check_bounds
-from rapid.config import Config, PpoConfig
+from rapid.config import Config, NetworkConfig, PpoConfig
 from rapid.errors import RapidError, did_you_mean
 from rapid.safety import read_box
-from rapid.scenarios import get_scenario
+from rapid.scenarios import NUM_ACTIONS, get_scenario
 
 T = TypeVar("T")
+
+MOST_WEIGHTS = 10**8
+"""Of one network; with gradients, Adam's two moments and the target network that is 2 GB."""
+MOST_ROWS = 10**7
+"""Transitions of one rollout."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -152,6 +158,17 @@ def validate(config: Config) -> Config:
             network.width % network.heads == 0,
             f"a multiple of network.heads = {network.heads}",
         ),
+        (
+            "network.width" if network.kind in ("rapid", "attentive") else "network.hidden",
+            weights_about(network) <= MOST_WEIGHTS,
+            f"smaller, or the network's other sizes: it would have about {weights_about(network):.2g} weights, and "
+            f"{MOST_WEIGHTS:.0e} are allowed",
+        ),
+        (
+            "adapt.ppo.rollout",
+            adapt.ppo.num_envs * adapt.ppo.rollout <= MOST_ROWS,
+            f"at most {MOST_ROWS} together with adapt.ppo.num_envs = {adapt.ppo.num_envs}, as a product",
+        ),
         ("network.memory", not network.memory, "false: offline data holds no memory, adapt.memory gives one"),
         ("adapt.memory", not adapt.memory or adapt.ppo.steps > 0, "false where adapt.ppo.steps is 0"),
         ("adapt.memory", not (adapt.memory and (adapt.mirror or network.mirror)), "false where the road is mirrored"),
@@ -181,6 +198,17 @@ def validate(config: Config) -> Config:
         if not good:
             raise RapidError(f"Setting '{name}' is {value(config, name)}, but must be {expected}.")
     return config
+
+
+def weights_about(network: NetworkConfig) -> int:
+    """Return how many weights a network has, without norms, biases and embeddings."""
+    if network.kind in ("rapid", "attentive"):
+        layer = 4 * network.width**2 + 2 * network.width * network.feedforward
+        policies = network.num_policies if network.kind == "rapid" else 1
+        return (policies * network.layers + network.decoder_layers) * layer
+    sizes = (network.vehicles * 8, *network.hidden, NUM_ACTIONS)
+    policies = network.num_policies if network.kind == "mlp-mixture" else 1
+    return policies * sum(before * after for before, after in pairwise(sizes))
 
 
 def least_steps(ppo: PpoConfig) -> int:

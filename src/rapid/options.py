@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 
 from tyro.conf import Positional, arg
 
-from rapid.bounds import Count, Positive, Seed
+from rapid.bounds import Bounds, Positive, Seed, SideOrNone
 from rapid.config import (
     AdaptConfig,
     CollectConfig,
@@ -133,13 +133,13 @@ class Distill:
     beside it if another command made that."""
     force: bool = False
     """Replace what another command made in the place of the output."""
-    curve_spawns: Count = EvaluateConfig.curve_spawns
+    curve_spawns: SideOrNone = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
     tracking: Tracking = Config.tracking
     """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""
     seed: Seed = Config.seed
     """Decides the weights, the batches and the inner attack."""
-    seeds: Positive = 1
+    seeds: Annotated[int, Bounds(1, 1000)] = 1
     """Train this many agents, of the seeds from --seed on, into OUT/seed-N. Baselines (kind mlp, neither robust nor
     Munchausen term) train together as one stack in less than half the time, with one record for all in OUT/together;
     others one after another, where a process for each seed is faster."""
@@ -162,7 +162,7 @@ class Adapt:
     beside it if another command made that."""
     force: bool = False
     """Replace what another command made in the place of the output."""
-    curve_spawns: Count = EvaluateConfig.curve_spawns
+    curve_spawns: SideOrNone = EvaluateConfig.curve_spawns
     """Episodes of each point of the learning curve."""
     tracking: Tracking = Config.tracking
     """Where the metrics are copied to; offline unless WANDB_MODE says otherwise."""

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rapid.bounds import AboveZero, Bounds, Count, Positive, Seed
+from rapid.bounds import AboveZero, Bounds, Positive, Seed, Side, SideOrNone, Workers
 from rapid.config import CollectConfig, Config, Recipe, Scale, TeacherConfig
 from rapid.options import Flat, Source
 from rapid.scenarios import PAPER_SCENARIOS
@@ -24,11 +24,11 @@ class TeachBench:
     [teacher] section, for servers and recordings. The others are compared with the first."""
     scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = PAPER_SCENARIOS
     """Where they drive; by default the paper's three."""
-    spawns: Positive = 32
+    spawns: Side = 32
     """Episodes of each teacher in each scenario."""
     spawn_set: Literal["tune", "test"] = "tune"
     """Where the spawn seeds come from: `tune` to choose a teacher, `test` to report one that was chosen elsewhere."""
-    lockstep: Positive = 64
+    lockstep: Side = 64
     """Episodes driven side by side: a `local` model answers all of them together."""
     out: str = "teach-bench"
     """Directory of the rows, the table and the plot."""
@@ -50,11 +50,11 @@ class Certify:
     """Directory of the agent, perhaps behind shield:BOX:."""
     radii: tuple[AboveZero, ...] = (0.0005, 0.001, 0.005)
     """Radii of the attacks (L-infinity, features scaled to +-1: 0.0005 is 0.1 m along the road and 0.04 m/s)."""
-    decisions: Positive = 100
+    decisions: Side = 100
     """Decisions that are certified for each radius. A perceptron's take milliseconds, a mixture's about a second."""
-    spawns: Positive = 20
+    spawns: Side = 20
     """Test spawns, on the way through which the agent decides."""
-    returns: Count = 0
+    returns: SideOrNone = 0
     """Of how many of them the return is bounded too, by the tree of all actions that an attack may bring about."""
     scenario: str = ""
     """Where it drives; by default where it was trained."""
@@ -113,7 +113,7 @@ class Reproduce:
     """How much is run: tiny (minutes), quick, full (five trainings, 200 spawns)."""
     engine: Annotated[str, arg(metavar="{local,ray}")] = CollectConfig.engine
     """Where parts are computed."""
-    workers: Positive = 1
+    workers: Workers = 1
     """Parts under way at once."""
     store: str = "runs/store"
     """Directory of finished parts."""
@@ -231,7 +231,7 @@ class VerifySimulator:
     scenarios: Annotated[tuple[str, ...], arg(name="scenario")] = ()
     """Scenarios or HighwayEnv's ids; by default the paper's with both dynamics, HighwayEnv's own, and others that reach
     the rest of the configuration; then the time limits at many frequencies are compared too."""
-    processes: Positive = 1
+    processes: Workers = 1
     """Processes that drive highway-env, which takes nearly all of the time."""
     plain_math: bool = True
     """Let NumPy use the C library's functions under highway-env, so that states can be compared to the last bit.
