@@ -326,7 +326,7 @@ def test_sizes_that_multiply_are_refused_before_anything_is_allocated(overrides:
 
 
 @pytest.mark.parametrize("kind", ["rapid", "attentive", "mlp", "mlp-mixture"])
-def test_weights_are_counted_about_right(kind: str):
+def test_weights_are_counted_about_right(kind: Any):
     from rapid.networks.q_network import QNetwork
 
     network = NetworkConfig(kind=kind, width=128, heads=4, layers=3, feedforward=256, num_policies=3)

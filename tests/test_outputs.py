@@ -3,6 +3,7 @@
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ REQUEST = {"verb": "mix", "mix": {"p": 0.5, "size": 100}, "reads": {"dataset": "
 OTHER = {**REQUEST, "mix": {"p": 0.25, "size": 100}}
 
 
-def make(place: Path, request: dict, force: bool = False, **options) -> None:
+def make(place: Path, request: dict, force: bool = False, **options: Any) -> None:
     with claimed(place, request, ("made*",), force=force, **options):
         (place / "made.txt").write_text(str(request))
 
@@ -79,8 +80,9 @@ def test_a_damaged_record_blocks_only_without_force(tmp_path: Path):
     make(tmp_path, REQUEST, force=True)
 
 
-def test_without_a_place_the_second_request_goes_beside_the_first(tmp_path: Path, monkeypatch):
+def test_without_a_place_the_second_request_goes_beside_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
+    second = Path()
     for _ in range(2):
         first, second = place_for("out", REQUEST), place_for("out", OTHER)
         if first == Path("out"):
@@ -117,7 +119,12 @@ def run(*words: str) -> int:
     ],
 )
 def test_every_verb_leaves_what_another_made_and_says_what_differs(
-    tmp_path, monkeypatch, capsys, first, second, differs
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    first: tuple[str, ...],
+    second: tuple[str, ...],
+    differs: str,
 ):
     monkeypatch.chdir(tmp_path)
     assert run(*first, "--out", "out") == 0
@@ -135,7 +142,9 @@ def test_every_verb_leaves_what_another_made_and_says_what_differs(
     assert contents(tmp_path) != before
 
 
-def test_a_file_of_the_users_is_not_collected_over(tmp_path, monkeypatch, capsys):
+def test_a_file_of_the_users_is_not_collected_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "transitions.parquet").write_text("mine")
@@ -145,13 +154,17 @@ def test_a_file_of_the_users_is_not_collected_over(tmp_path, monkeypatch, capsys
         assert contents(tmp_path) == {"out/transitions.parquet": b"mine"}
 
 
-def test_evaluate_without_agents_leaves_nothing(tmp_path, monkeypatch, capsys):
+def test_evaluate_without_agents_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     monkeypatch.chdir(tmp_path)
     assert run("evaluate") == 2
     assert not list(tmp_path.iterdir())
 
 
-def test_evaluate_without_a_place_prints_its_table_and_keeps_nothing(tmp_path, monkeypatch, capsys):
+def test_evaluate_without_a_place_prints_its_table_and_keeps_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
@@ -163,7 +176,9 @@ def test_evaluate_without_a_place_prints_its_table_and_keeps_nothing(tmp_path, m
         assert not list(tmp_path.iterdir())
 
 
-def test_an_exported_file_is_not_replaced(tmp_path, monkeypatch, capsys):
+def test_an_exported_file_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     pytest.importorskip("onnx")
     monkeypatch.chdir(tmp_path)
     assert run(*DISTILL, "mlp", "--out", "out") == 0

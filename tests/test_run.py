@@ -12,6 +12,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_a_run_leaves_agents_rows_and_a_page(finished: Path):
 
 
 @pytest.mark.parametrize("kind", ["mlp", "rapid"])
-def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, kind):
+def test_several_seeds_are_what_each_is_alone(finished: Path, tmp_path: Path, kind: Any):
     config = preset("strong", "tiny")
     if kind == "mlp":
         config = offline_baseline(config, "cql")
@@ -195,13 +196,13 @@ def test_other_settings_and_unknown_steps_are_refused(config: Config, finished: 
 
 @pytest.mark.parametrize("damaged", [False, True])
 def test_force_begins_anew_and_removes_only_what_a_run_makes(
-    config: Config, tmp_path: Path, monkeypatch, damaged: bool
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damaged: bool
 ):
     # As far as the mixture: no step after it is of interest here.
     monkeypatch.setattr("rapid.run.distill_agent", lambda *given: (_ for _ in ()).throw(RapidError("Enough.")))
     home, other = tmp_path / "run", apply_overrides(config, {"seed": 1})
 
-    def begin(config: Config, **options) -> str:
+    def begin(config: Config, **options: Any) -> str:
         with pytest.raises(RapidError) as told:
             run(config, home, say=lambda line: None, **options)
         return str(told.value)
