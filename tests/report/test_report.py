@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from samples import HOSTILE, SCENARIO, full, recording, rows
@@ -61,6 +62,28 @@ def test_page_is_well_formed_and_whole(hostile: str) -> None:
     words = " ".join(reader.words)
     for expected in ("always-slower", "20.42", "14.77", "n/a", "on this road ε = 0.1 means up to 20 m", "1.2 m across"):
         assert expected in words
+
+
+def test_the_worst_case_has_a_table_and_over_sizes_a_plot() -> None:
+    def plot(run: ReportData) -> list[dict[str, Any]]:
+        return json.loads(Reader(page(run)).scripts[0])["worst"]
+
+    pair = [*rows("RAPID"), *rows("RAPID", "fgsm"), *rows("RAPID", "pgd")]
+    content = page(ReportData(title="t", rows=pair, trained=False))
+    assert 'id="worst"' in content
+    assert "most often the worst" in content
+    # What was not trained has no curves to miss.
+    assert "No training was recorded" not in content
+    assert plot(ReportData(title="t", rows=pair)) == []
+    assert 'id="worst"' not in page(full())  # two attacks that are not of the same size
+    kinds = ("pgd", "directed")
+    swept = [
+        *rows("RAPID"),
+        *(row for r in (0.01, 0.02, 0.05) for k in kinds for row in rows("RAPID", f"{k}:radius={r}")),
+    ]
+    charts = plot(ReportData(title="t", rows=swept))
+    assert [x for x, _ in charts[0]["series"][0]["points"]] == [0, 2, 4, 10]
+    assert charts[1]["series"][0]["points"][1][1] == pytest.approx(1 / 8)
 
 
 def test_text_of_others_stays_text() -> None:

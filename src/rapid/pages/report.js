@@ -11,6 +11,9 @@ if (curves) {
   if (rest.childElementCount) curves.append(element("details", {}, element("summary", {}, "Terms of the losses"), rest));
 }
 
+const worst = document.getElementById("worst-canvas");
+if (worst && data.worst.length) worst.append(element("div", { class: "charts" }, ...data.worst.map(lineChart)));
+
 // A moment in the address: #moment=EPISODE,OTHER,SECONDS
 const readMoment = () => {
   const found = /^#moment=(\d+),(\d*),(\d+(?:\.\d+)?)$/.exec(location.hash);

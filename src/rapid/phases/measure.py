@@ -22,7 +22,7 @@ from rapid.config_io import to_dict
 from rapid.engines import run_jobs
 from rapid.errors import DamagedError, RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
-from rapid.evaluation.recording import Recording, explained_by, save_recordings
+from rapid.evaluation.recording import Recording, explained_by, load_recordings, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
 from rapid.evaluation.worst import worst_text
@@ -32,10 +32,10 @@ from rapid.outputs import EVALUATION, claimed
 from rapid.phases.checks import check
 from rapid.phases.data import given_data
 from rapid.progress import task, warn
-from rapid.report import ReportData, write_figures
+from rapid.report import ReportData, write_figures, write_report
 from rapid.report.figures import save_figure
 from rapid.report.sweep import sweep_figure, sweep_text
-from rapid.runs import commit
+from rapid.runs import commit, versions
 from rapid.scenarios import get_scenario
 from rapid.spawns import spawn_seeds
 from rapid.teacher import make_teacher
@@ -61,7 +61,7 @@ def compare(
     force: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> list[EpisodeRow]:
-    """Drive the agents named and write rows, table and plot; `teacher` is the configured teacher.
+    """Drive the agents named and write rows, table, plot and page; `teacher` is the configured teacher.
 
     Args:
         config: where and how they drive.
@@ -99,10 +99,24 @@ def compare(
             specs = [*specs, *floors]
         rows = measure(config, config.scenario, specs, place, labels, opened)
         if out:
-            write_figures(ReportData(title=f"{config.scenario}", rows=rows), place)
+            report = ReportData(
+                title=f"{len(specs)} drivers on {config.scenario}",
+                settings=to_dict(config),
+                versions=versions(),
+                commit=commit(),
+                rows=rows,
+                recordings=recorded(place),
+                trained=False,
+            )
+            write_figures(report, place)
+            write_report(report, place / "report.html")
         if say:
             say((place / "summary.txt").read_text(encoding="utf-8"))
-            say(f"Rows, table and plot: {place}" if out else "Nothing was kept; --out DIRECTORY keeps rows and plot.")
+            say(
+                f"Rows, table and plot: {place}\nThe page: {place / 'report.html'}"
+                if out
+                else "Nothing was kept; --out DIRECTORY keeps rows, plot and page."
+            )
     return rows
 
 
@@ -192,6 +206,12 @@ def measure(
     if (figure := sweep_figure(rows)) is not None:
         save_figure(figure, out / "sweep.png")
     return rows
+
+
+def recorded(place: Path) -> list[Recording]:
+    """Return the episodes that were kept while measuring there, those of the last agent first."""
+    files = sorted((place / "parts").glob("*.recordings.json"), reverse=True)
+    return [recording for path in files for recording in load_recordings(path)]
 
 
 def _kept(part: Path) -> list[EpisodeRow] | None:

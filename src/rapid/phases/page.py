@@ -11,10 +11,11 @@ from rapid.config_io import apply_overrides, to_dict
 from rapid.data.dataset import load_dataset, summary
 from rapid.data.fallbacks import fallback_notice
 from rapid.evaluation.metrics import load_rows
-from rapid.evaluation.recording import Recording, load_recordings
+from rapid.evaluation.recording import Recording
 from rapid.files import read_json
 from rapid.phases.adapt import ONLINE, PPO
 from rapid.phases.data import data_folders
+from rapid.phases.measure import recorded
 from rapid.presets import as_options, of_file, online_baseline, without_presets
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.runs import STEPS
@@ -37,11 +38,7 @@ def write_run_report(config: Config, directory: Path) -> Path:
     """Gather the artefacts of a run into ``report.html`` and the figures beside it."""
     manifest = read_json(directory / "run.json", "run manifest")
     steps = {step: directory / "steps" / f"{step}.json" for step in STEPS}
-    recordings = [
-        recording
-        for path in sorted((directory / "evaluate" / "parts").glob("*.recordings.json"), reverse=True)
-        for recording in load_recordings(path)
-    ]
+    recordings = recorded(directory / "evaluate")
     teacher_data = load_dataset(data_folders(config, directory)[0])
     notes = []
     if config.data:

@@ -70,6 +70,8 @@ class ReportData:
     """Episodes to watch."""
     dataset: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Numbers of the dataset card, nested as they come."""
+    trained: bool = True
+    """Whether anything was trained; of a mere comparison nothing is said of wall time, curves, routing and data."""
     notes: Sequence[str] = ()
     """What a reader must know about this run."""
 

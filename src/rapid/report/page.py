@@ -7,11 +7,12 @@ from rapid.evaluation.summary import summarize, summary_text
 from rapid.files import write_text
 from rapid.pages import PLAYER, fill_page
 from rapid.pages.episodes import ACTION_WORDS, side_by_side
-from rapid.pages.markup import join, tag
+from rapid.pages.markup import Markup, join, tag
 from rapid.report import sections
 from rapid.report.curves import charts
 from rapid.report.data import ReportData
 from rapid.report.routing import routing
+from rapid.report.sweep import sweep_charts
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
 
@@ -47,16 +48,8 @@ def page(run: ReportData) -> str:
                 "No episode was recorded.",
             ),
             sections.attacks(run, summaries),
-            sections.drawn(
-                "curves",
-                "Learning curves",
-                bool(curves),
-                "Point at a curve to read it; click a name to hide it. Returns are of tuning spawns, which are never "
-                "those of the tables.",
-                "No training was recorded.",
-            ),
-            routing(run.routing, lanes),
-            sections.dataset(run.dataset),
+            sections.worst(run),
+            *(_training(run, bool(curves), lanes) if run.trained else ()),
             sections.made_by(run),
             tag("details", tag("summary", "The summary as plain text"), tag("pre", summary_text(run.rows))),
         ]
@@ -64,7 +57,23 @@ def page(run: ReportData) -> str:
     return fill_page(
         run.title,
         body,
-        {"actions": ACTION_WORDS, "charts": curves, "episodes": pictures},
+        {"actions": ACTION_WORDS, "charts": curves, "worst": sweep_charts(run.rows), "episodes": pictures},
         scripts=(*PLAYER, "tables.js", "charts.js", "report.js"),
         styles=("base.css", "report.css", "player.css"),
     )
+
+
+def _training(run: ReportData, has_curves: bool, lanes: int) -> list[Markup]:
+    """Return what there is to say of trainings: their curves, what phase 3 made of the routing, their data."""
+    return [
+        sections.drawn(
+            "curves",
+            "Learning curves",
+            has_curves,
+            "Point at a curve to read it; click a name to hide it. Returns are of tuning spawns, which are never "
+            "those of the tables.",
+            "No training was recorded.",
+        ),
+        routing(run.routing, lanes),
+        sections.dataset(run.dataset),
+    ]

@@ -5,6 +5,7 @@ from typing import Any
 
 from rapid.evaluation.statistics import ENOUGH_SEEDS
 from rapid.evaluation.summary import NOT_APPLICABLE, NOT_APPLICABLE_WHY, NOT_RUN, SummaryRow, ahead_of, number
+from rapid.evaluation.worst import worst_cases
 from rapid.pages.markup import Markup, facts, join, tag
 from rapid.progress import format_seconds
 from rapid.report.data import ReportData, paper_return
@@ -15,6 +16,7 @@ from rapid.report.tables import (
     caption,
     interval_words,
     results_table,
+    worst_table,
 )
 from rapid.scenarios import get_scenario
 
@@ -54,7 +56,8 @@ def head(run: ReportData) -> Markup:
     ]
     if run.command:
         parts.append(tag("p", "Repeat it with ", tag("code", run.command), class_="command"))
-    parts.append(_timeline(run.timings))
+    if run.trained:
+        parts.append(_timeline(run.timings))
     return tag("header", *parts)
 
 
@@ -195,6 +198,24 @@ def attacks(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
             ),
         ]
     return section("attacks", "Under attack", *parts)
+
+
+def worst(run: ReportData) -> Markup:
+    """Return the worst case over attacks of the same size, and over sizes if several were measured; else nothing."""
+    cases = worst_cases(run.rows)
+    if not cases:
+        return Markup("")
+    parts: list[Markup] = []
+    for scenario, threat in dict.fromkeys((case.scenario, case.threat) for case in cases):
+        here = [case for case in cases if (case.scenario, case.threat) == (scenario, threat)]
+        parts += [tag("h3", f"{scenario}, within {threat.words(get_scenario(scenario).lanes)}")]
+        parts += [worst_table(here, run.lead)]
+    intro = (
+        "An attacker chooses anew for every spawn. A worst case is the mean over spawns of the least return under any "
+        "of the attacks of one size, no attack among them. Agents without a network meet fewer attacks, so theirs is "
+        "an upper bound of what the same attacker could do."
+    )
+    return section("worst", "The worst case", tag("p", intro), *parts, tag("div", id="worst-canvas"))
 
 
 def dataset(numbers: Mapping[str, Any]) -> Markup:

@@ -1,6 +1,7 @@
 """The worst case over the size of the attack: a table and a plot."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -70,6 +71,38 @@ def sweep_figure(rows: Sequence[EpisodeRow]) -> Figure | None:
     title = f"{cases[0].scenario}: worst case over attacks; dotted: without attack"
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     return figure
+
+
+def sweep_charts(rows: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
+    """Return return and crash share in the worst case over the size for a page's script; none of too few sizes."""
+    cases = swept(rows)
+    agents = list(dict.fromkeys(case.agent for case in cases))
+    return [
+        {
+            "id": f"worst-{name}",
+            "title": f"{title} in the worst case, by the size of the attack",
+            "x": "metres along the road",
+            "y": title.lower(),
+            "zero": True,
+            "marks": [],
+            "series": [
+                {
+                    "name": label_of(agent),
+                    "points": [
+                        (0.0, _clean(rows, agent, name).value),
+                        *(
+                            (200 * radius, getattr(case, name).value)
+                            for radius in _radii(cases)
+                            if (case := case_of(cases, agent, radius)) is not None
+                        ),
+                    ],
+                }
+                for agent in agents
+            ],
+        }
+        for title, name in (("Return", "episode_return"), ("Crash share", "crashed"))
+        if cases
+    ]
 
 
 def case_of(cases: Sequence[Worst], agent: str, radius: float) -> Worst | None:

@@ -7,7 +7,17 @@ from contextlib import suppress
 from rapid.attacks.spec import parse_attack
 from rapid.errors import RapidError
 from rapid.evaluation.statistics import Estimate
-from rapid.evaluation.summary import KINDS, NOT_APPLICABLE, NOT_RUN, AttackCell, SummaryRow, number, units
+from rapid.evaluation.summary import (
+    KINDS,
+    NOT_APPLICABLE,
+    NOT_RUN,
+    AttackCell,
+    SummaryRow,
+    label_of,
+    number,
+    units,
+)
+from rapid.evaluation.worst import Worst
 from rapid.experiments.paper import PaperResult
 from rapid.pages.episodes import ACTION_WORDS
 from rapid.pages.markup import Markup, tag, text
@@ -82,6 +92,31 @@ def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
             for attack, cell in {"none": clean, **row.attacks}.items()
         ]
         body.append(tag("tr", _name(row, lead), *cells, class_=_row_class(row, lead)))
+    return _table(heads, body)
+
+
+def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
+    """Return the table of one scenario and threat: what the worst of the attacks leaves on every spawn."""
+    heads = [
+        ("agent", "", "text"),
+        ("return", "mean over spawns of the least return under any of the attacks", "number"),
+        ("crashed", "share of these worst episodes that end in a crash", "number"),
+        ("attacks", "how many attacks were made on it", "number"),
+        ("most often the worst", "the attack under which the most spawns earned least", "text"),
+    ]
+    span = _span([case.episode_return for case in cases])
+    body = [
+        tag(
+            "tr",
+            tag("th", label_of(case.agent), scope="row", class_="name", data_value=label_of(case.agent).lower()),
+            _cell(case.episode_return, bar=span),
+            _cell(case.crashed, 0, 100, " %"),
+            tag("td", len(case.attacks), data_value=len(case.attacks)),
+            tag("td", case.worst_attack, data_value=case.worst_attack),
+            class_="lead" if case.agent == lead else None,
+        )
+        for case in cases
+    ]
     return _table(heads, body)
 
 
