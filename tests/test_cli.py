@@ -182,3 +182,8 @@ def test_the_example_without_an_agent_says_how_it_is_used():
     assert done.returncode == 1
     assert "Usage: python drive_onnx.py AGENT.onnx" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_python_dash_m_is_the_same_command() -> None:
+    ran = subprocess.run([sys.executable, "-m", "rapid", "--version"], capture_output=True, text=True, check=True)
+    assert ran.stdout.startswith("rapid ")

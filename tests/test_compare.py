@@ -22,6 +22,9 @@ def test_a_teacher_is_opened_once(tmp_path, monkeypatch):
     rows = measure.compare(config, ["teacher", "slower"], tmp_path / "out")
     assert len(rows) == 2
     assert len(made) == 1
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "2 drivers on lane-3-density-2" in page
+    assert "No training was recorded" not in page
     # And again, where nothing is driven.
     assert measure.compare(config, ["teacher", "slower"], tmp_path / "out") == rows
     assert len(made) == 2

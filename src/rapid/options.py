@@ -175,7 +175,7 @@ class Adapt:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare agents over the same fixed spawns, clean and under attacks, in one table and one plot."""
+    """Compare agents over the same fixed spawns, clean and under attacks, in one table, one plot and one page."""
 
     agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
     """Directories of agents, ONNX files, and drivers by name, each with shield:BOX: before it if it is to drive behind
@@ -187,8 +187,8 @@ class Evaluate:
     simulator: Annotated[str, arg(metavar="{compiled,highway-env}")] = Config.simulator
     """The compiled twin, or highway-env itself."""
     out: str = ""
-    """Directory of the episodes, the table and the plot, where the same command goes on after an interruption; without
-    it the table is printed and nothing is kept."""
+    """Directory of the episodes, the table, the plot and the page, where the same command goes on after an
+    interruption; without it the table is printed and nothing is kept."""
     force: bool = False
     """Replace what another command made in the place of the output."""
     seed: Seed = Config.seed

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from samples import HOSTILE, full, recording
+from samples import HOSTILE, full, recording, rows
 
 from browser import Tab, tab, until
 from rapid.evaluation.recording import Recording
@@ -312,6 +312,19 @@ def test_on_paper_there_is_nothing_to_press(opened: Open) -> None:
     for hidden in (".play", ".scrub", ".strip", ".sharing"):
         assert not page.locator(hidden).first.is_visible()
     assert page.locator(".player canvas").first.is_visible()
+
+
+def test_the_worst_case_is_drawn_over_the_size_of_the_attack(opened: Open) -> None:
+    kinds = [f"{kind}:radius={radius}" for radius in (0.01, 0.02, 0.05) for kind in ("pgd", "directed")]
+    swept = [row for attack in ("none", *kinds) for row in rows("RAPID", attack)]
+    page = opened(replace(run(), rows=swept, trained=False)).page
+    assert page.locator("#worst-canvas svg").count() == 2
+    assert page.locator("#worst table").count() == 3
+    button(page, "most often the worst").first.click()
+    page.locator("#worst-canvas svg").first.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert "metres along the road 2" in page.locator("#worst-canvas svg").first.inner_html()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
