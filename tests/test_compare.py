@@ -1,17 +1,23 @@
 """Comparing agents: each is opened once."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
 
 from rapid.config import TeacherConfig
 from rapid.phases import measure
 from rapid.presets import preset
+from rapid.teacher.decision import Teacher
 
 
-def test_a_teacher_is_opened_once(tmp_path, monkeypatch):
+def test_a_teacher_is_opened_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A language model takes long to load."""
-    made, make = [], measure.make_teacher
+    made: list[TeacherConfig] = []
+    make = measure.make_teacher
 
-    def counted(config, *road):
+    def counted(config: TeacherConfig, *road: Any) -> Teacher:
         made.append(config)
         return make(config, *road)
 
