@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rapid
-from rapid.agents.saved import remembers
+from rapid.agents.saved import moved_on, remembers
 from rapid.agents.shipped import agent_folder, is_shipped
+from rapid.defences import is_defence, unwrapped
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import Kind
 from rapid.files import read_json
@@ -53,7 +54,7 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
     """Return the agent that `spec` names: a saved agent's directory, an ONNX file, or a driver's name.
 
     Before any of them may stand ``shield:BOX:``, which puts the interval filter around it (:mod:`rapid.safety`), with
-    a radius such as 0.1 or metres and m/s such as 1m,0.5.
+    a radius such as 0.1 or metres and m/s such as 1m,0.5; before one with Q-values a defence (:mod:`rapid.defences`).
 
     `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are; `device` is where a
     saved agent's network goes.
@@ -74,6 +75,11 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
         lanes = get_scenario(scenario).lanes
         read_box(box, lanes)
         return shielded(open_agent(inner, scenario, seed, device), box, lanes)
+    if is_defence(spec):
+        from rapid.agents.defended import defended
+
+        members, inner = unwrapped(spec)
+        return defended(open_agent(inner, scenario, seed, device), members, scenario, seed)
     if spec in SCRIPTED or spec.startswith("blind:"):
         return Scripted(spec, get_scenario(scenario).lanes, seed, scenario)
     if spec in PLANNERS:
@@ -104,8 +110,8 @@ def own_scenario(specs: Sequence[str]) -> str:
     """
     found: dict[str, str] = {}
     for spec in specs:
-        while spec.startswith(SHIELD):
-            spec = spec[len(SHIELD) :].partition(":")[2]
+        while (shield := spec.startswith(SHIELD)) or is_defence(spec):
+            spec = spec[len(SHIELD) :].partition(":")[2] if shield else unwrapped(spec).agent
         path = agent_folder(spec) / "config.json"
         if path.is_file():
             metadata = read_json(path, "agent").get("metadata", {})
@@ -125,6 +131,11 @@ def network_agent(spec: str, device: str = "cpu") -> "QAgent":
     """
     from rapid.agents.shielded import shielded
 
+    if is_defence(spec):
+        raise RapidError(
+            f"'{spec}' is an agent behind a defence without training, which is neither exported nor certified. Give "
+            "the agent alone, or with shield:BOX: before it."
+        )
     if spec.startswith(SHIELD):
         box, _, inner = spec[len(SHIELD) :].partition(":")
         agent = network_agent(inner, device)
@@ -208,7 +219,7 @@ class _AgentDriver:
         if (state_BS := self.memory(worlds, len(seen_BVF))) is not None and self._state_BS is not None:
             action_B = np.asarray(self._agent.act(seen_BVF[worlds], state_BS), np.int64)
             self._before_BS = state_BS
-            self._state_BS[worlds] = self._agent.remember(state_BS, action_B)
+            self._state_BS[worlds] = moved_on(self._agent, seen_BVF[worlds], state_BS, action_B)
             return action_B
         if self._everywhere:
             return np.asarray(self._agent.act(seen_BVF), np.int64)[worlds]

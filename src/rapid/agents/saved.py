@@ -54,7 +54,8 @@ class Agent(Protocol):
 class RememberingAgent(Protocol):
     """An agent with a memory: a state (B, S) for each of B worlds, kept by whoever drives it.
 
-    The state begins with the episode and moves on with each action, whatever is seen.
+    The state begins with the episode and moves on with each action. What depends on what was seen too is told it
+    before, by a method ``notice(obs_BVF, state_BS)`` that returns the states; most have none.
     """
 
     has_memory: bool
@@ -77,8 +78,21 @@ def remembers(agent: Any) -> bool:
     return bool(getattr(agent, "has_memory", False))
 
 
+def noticed(agent: Any, obs_BVF: np.ndarray, state_BS: np.ndarray) -> np.ndarray:
+    """Return an agent's states (B, S) after it was shown these observations."""
+    return agent.notice(obs_BVF, state_BS) if callable(getattr(agent, "notice", None)) else state_BS
+
+
+def moved_on(agent: Any, obs_BVF: np.ndarray, state_BS: np.ndarray, action_B: np.ndarray) -> np.ndarray:
+    """Return an agent's states (B, S) after it was shown these observations and took these actions."""
+    return agent.remember(noticed(agent, obs_BVF, state_BS), action_B)
+
+
 def remembered(agent: Any, action_T: Sequence[int] | np.ndarray) -> np.ndarray | None:
-    """Return an agent's states (T + 1, S) before each action of an episode and after the last; None without memory."""
+    """Return an agent's states (T + 1, S) before each action of an episode and after the last; None without memory.
+
+    It is one whose memory does not depend on what was seen.
+    """
     if not remembers(agent):
         return None
     states = [agent.start(1)]

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rapid.agents.saved import remembers
+from rapid.agents.saved import moved_on, noticed, remembers
 from rapid.attacks.attack import Base, Field, Moment, Needs, Shown, network_of, values_of
 from rapid.attacks.directed import reachable, reachable_without_gradients
 from rapid.attacks.draws import Source
@@ -72,7 +72,9 @@ class WorldAttack(Base):
         within, points_BAVF = self._reach(field, now)
         within_BA = within.cpu().numpy()
         row_M, action_M = np.nonzero(within_BA)
-        memory_MS = None if now.state_BS is None else now.state_BS[row_M]
+        memory_MS = None
+        if now.state_BS is not None:
+            memory_MS = noticed(field.agent, points_BAVF[row_M, action_M].cpu().numpy(), now.state_BS[row_M])
         copies = drive_on(
             field.agent, state, now.env.settings, now.worlds[row_M], action_M, self.spec.horizon, memory_MS
         )
@@ -131,7 +133,7 @@ def act_on(
     if memory_BS is None:
         return np.asarray(agent.act(obs_BVF), np.int64), None
     action_B = np.asarray(agent.act(obs_BVF, memory_BS), np.int64)
-    return action_B, agent.remember(memory_BS, action_B)
+    return action_B, moved_on(agent, obs_BVF, memory_BS, action_B)
 
 
 def drive_on(
@@ -154,7 +156,7 @@ def drive_on(
         worlds: (M,), which of them; any number of times each.
         actions_M: the first decision of each copy.
         horizon: decisions.
-        memory_MS: what the agent remembers before that decision, if it has a memory.
+        memory_MS: what the agent remembers at that decision, what it is shown there included, if it has a memory.
     """
     vehicles = getattr(agent, "vehicles", NUM_VEHICLES)
     state, earned_M, copies = state.take(worlds), np.zeros(len(actions_M)), np.arange(len(actions_M))
