@@ -367,7 +367,7 @@ def _one(text: str, scenario: str, vehicles: int, seed: int) -> Defence:
             f"'{text}' purifies observations of {NUM_VEHICLES} vehicles, as shipped data has them, but the agent reads "
             f"{vehicles}. Choose another defence, or an agent that reads {NUM_VEHICLES}."
         )
-    return Purifier(_fitted(kind, size, scenario.partition(":")[0]), lanes)
+    return Purifier(fitted(kind, size, scenario.partition(":")[0]), lanes)
 
 
 def _number(text: str) -> float:
@@ -379,7 +379,7 @@ def _number(text: str) -> float:
 
 
 @lru_cache
-def _fitted(kind: str, size: int, road: str) -> nn.Module:
+def fitted(kind: str, size: int, road: str) -> nn.Module:
     """Return what squeezes observations of a road, fitted on what its shipped random and teacher drivers saw."""
     from rapid.data.dataset import load_dataset
 

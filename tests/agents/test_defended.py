@@ -8,7 +8,7 @@ from rapid.agents.open import check_road, network_agent, open_agent, own_scenari
 from rapid.agents.saved import moved_on
 from rapid.attacks import get_attack
 from rapid.attacks.attack import offers, values_of
-from rapid.defences import Smoothing, TrackFilter, _fitted, make_defence, matched, unwrapped
+from rapid.defences import Smoothing, TrackFilter, make_defence, matched, unwrapped
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.encoding import feature_scale
@@ -38,7 +38,7 @@ def driven() -> np.ndarray:
 
 
 @pytest.mark.parametrize("spec", ["noise-average:0", "smooth:1", "purify-pca:60"])
-def test_what_changes_nothing_leaves_the_decisions_and_values_alone(driven, spec):
+def test_what_changes_nothing_leaves_the_decisions_and_values_alone(driven: np.ndarray, spec: str):
     plain, agent = open_agent(AGENT, SCENARIO), open_agent(f"{spec}:{AGENT}", SCENARIO)
     state = agent.start(8)
     for obs in driven:
@@ -47,7 +47,7 @@ def test_what_changes_nothing_leaves_the_decisions_and_values_alone(driven, spec
         state = moved_on(agent, obs, state, agent.act(obs, *given))
 
 
-def test_a_purifier_squeezes_more_the_fewer_numbers_it_has(driven):
+def test_a_purifier_squeezes_more_the_fewer_numbers_it_has(driven: np.ndarray):
     obs = torch.from_numpy(driven[3])
 
     def error(text: str) -> float:
@@ -61,23 +61,23 @@ def test_a_purifier_squeezes_more_the_fewer_numbers_it_has(driven):
     assert errors[-1] < 1e-10
     assert error("purify-autoencoder:8") < errors[0]
     fitted = error("purify-autoencoder:8")
-    _fitted.cache_clear()
+    fitted.cache_clear()
     assert error("purify-autoencoder:8") == fitted
 
 
 def test_the_track_filter_lets_what_cars_can_do_pass_and_clips_the_rest():
     env, agent = make_vec(SCENARIO, 16, autoreset=False), open_agent(AGENT, SCENARIO)
     seen, _ = env.reset(seed=spawn_seeds("tune", 16))
-    track, state, alive = TrackFilter(15), torch.zeros(16, 75), np.ones(16, np.bool_)
+    track, state, alive = TrackFilter(15), torch.zeros(16, 75), torch.ones(16, dtype=torch.bool)
     changed, rows = 0, 0
     for _ in range(20):
         obs = torch.from_numpy(seen.copy())
         believed = track.seen(obs, state)[0]
-        changed += int((believed != obs).any(-1)[alive].sum())
-        rows += int((obs[..., 0] > 0.5)[alive].sum())
+        changed += int((believed[alive] != obs[alive]).any(-1).sum())
+        rows += int((obs[alive][..., 0] > 0.5).sum())
         state = track.notice(obs, state)
         seen, _, terminated, truncated, _ = env.step(agent.act(seen))
-        alive &= ~(terminated | truncated)
+        alive &= ~torch.from_numpy(terminated | truncated)
     assert rows > 4000
     assert changed <= 0.002 * rows  # wrecks alone stop faster than drivers brake
     car = torch.tensor([[[1.0, 0, 0, 20, 0], [1, 50, 4, 20, 0], [1, 90, 0, 25, 0]]])
@@ -101,12 +101,13 @@ def test_cars_are_followed_when_their_rows_change_places_and_new_ones_are_believ
 
 
 @pytest.mark.parametrize("spec", ALL)
-def test_gradient_attacks_see_through_the_defence_and_its_memory(driven, spec):
+def test_gradient_attacks_see_through_the_defence_and_its_memory(driven: np.ndarray, spec: str):
     agent = open_agent(f"{spec}:{AGENT}", SCENARIO)
     state = agent.start(8)
     if agent.has_memory:
         state = moved_on(agent, driven[2], state, agent.act(driven[2], state))
     values = values_of(agent, state if agent.has_memory else None)
+    assert values is not None
     obs = torch.from_numpy(driven[3])
     q = values(obs)
     np.testing.assert_allclose(
@@ -123,7 +124,7 @@ def test_gradient_attacks_see_through_the_defence_and_its_memory(driven, spec):
 
 
 @pytest.mark.parametrize("spec", ALL)
-def test_it_drives_alone_and_in_company_alike_under_every_kind_of_attack(spec):
+def test_it_drives_alone_and_in_company_alike_under_every_kind_of_attack(spec: str):
     seeds = spawn_seeds("tune", 3)
     agent = open_agent(f"{spec}:{AGENT}", SCENARIO)
     assert agent.name == f"{spec}:shipped:lane-3-density-2/distilled" or agent.name.startswith(spec)
@@ -135,7 +136,7 @@ def test_it_drives_alone_and_in_company_alike_under_every_kind_of_attack(spec):
         assert together.kind == "learned"
 
 
-def test_defences_go_around_memories_filters_each_other_and_onnx(driven, tmp_path):
+def test_defences_go_around_memories_filters_each_other_and_onnx(driven: np.ndarray):
     seeds = spawn_seeds("tune", 2)
     for spec in (f"smooth:2:{ROBUST}", f"track:shield:0.1:{AGENT}", f"shield:0.1:smooth:2:purify-pca:8:{AGENT}"):
         assert len(run_episodes(open_agent(spec, SCENARIO), SCENARIO, seeds, "uniform")) == 2
@@ -169,7 +170,7 @@ def test_defences_go_around_memories_filters_each_other_and_onnx(driven, tmp_pat
         ("track:planner", "tells no Q-values"),
     ],
 )
-def test_bad_specs_are_refused(spec, said):
+def test_bad_specs_are_refused(spec: str, said: str):
     with pytest.raises(RapidError, match=said):
         open_agent(spec, SCENARIO)
 
