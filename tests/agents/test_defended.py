@@ -8,7 +8,7 @@ from rapid.agents.open import check_road, network_agent, open_agent, own_scenari
 from rapid.agents.saved import moved_on
 from rapid.attacks import get_attack
 from rapid.attacks.attack import offers, values_of
-from rapid.defences import Smoothing, TrackFilter, make_defence, matched, unwrapped
+from rapid.defences import Smoothing, TrackFilter, fitted, make_defence, matched, unwrapped
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.encoding import feature_scale
@@ -60,9 +60,9 @@ def test_a_purifier_squeezes_more_the_fewer_numbers_it_has(driven: np.ndarray):
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 1e-10
     assert error("purify-autoencoder:8") < errors[0]
-    fitted = error("purify-autoencoder:8")
+    once = error("purify-autoencoder:8")
     fitted.cache_clear()
-    assert error("purify-autoencoder:8") == fitted
+    assert error("purify-autoencoder:8") == once
 
 
 def test_the_track_filter_lets_what_cars_can_do_pass_and_clips_the_rest():
