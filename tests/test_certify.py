@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,14 +21,15 @@ from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.networks.encoding import feature_scale
+from rapid.networks.memory import DISTANCE, SPEED, Memory
 from rapid.networks.q_network import build_network
 from rapid.safety import Box, margins
-from rapid.scenarios import SLOWER
+from rapid.scenarios import FASTER, LANE_RIGHT, SLOWER
 from rapid.spawns import spawn_seeds
 
 SCENARIO = "lane-3-density-2"
-SMALL = {"width": 8, "heads": 2, "feedforward": 16, "layers": 1, "hidden": (16, 16), "vehicles": 6}
-NETWORKS = [
+SMALL: dict[str, Any] = {"width": 8, "heads": 2, "feedforward": 16, "layers": 1, "hidden": (16, 16), "vehicles": 6}
+NETWORKS: list[dict[str, Any]] = [
     {"kind": "mlp"},
     {"kind": "mlp", "input": "raw", "mask_absent": False},
     {"kind": "mlp-mixture", "mirror": True, "input": "normalized"},
@@ -38,7 +41,7 @@ NETWORKS = [
 ]
 
 
-def make(**settings) -> QAgent:
+def make(**settings: Any) -> QAgent:
     network = build_network(NetworkConfig(**{**SMALL, **settings}), 3, 0)
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -47,10 +50,15 @@ def make(**settings) -> QAgent:
     return QAgent(network.requires_grad_(False), "pupil")
 
 
+def _perceptron_of(agent: QAgent) -> Any:
+    head: Any = agent.network.head
+    return head.mlps[0]
+
+
 def careful() -> QAgent:
     """A pupil that brakes unless something speaks against it, and so comes to the end."""
     agent = make(kind="mlp")
-    last = [layer for layer in agent.network.head.mlps[0] if isinstance(layer, torch.nn.Linear)][-1]
+    last = [layer for layer in _perceptron_of(agent) if isinstance(layer, torch.nn.Linear)][-1]
     last.bias[SLOWER] += 0.5
     return agent
 
@@ -63,7 +71,7 @@ def offsets(samples: int, vehicles: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("settings", NETWORKS, ids=str)
-def test_bounds_hold_at_every_sampled_point_of_the_box(roads, settings):
+def test_bounds_hold_at_every_sampled_point_of_the_box(roads: Any, settings: dict[str, Any]):
     # Four observations, four radii and 800 points each, in eight networks: more than 10^5 points.
     agent, scale = make(**settings), feature_scale(3) * torch.tensor([0.0, 1, 1, 1, 1])
     obs, bounds = roads(4, absent=0.4)[:, :6], Bounds(agent.network)
@@ -78,7 +86,7 @@ def test_bounds_hold_at_every_sampled_point_of_the_box(roads, settings):
 
 
 @pytest.mark.parametrize("settings", NETWORKS, ids=str)
-def test_bounds_are_exact_at_a_point_and_tight_near_it(roads, settings):
+def test_bounds_are_exact_at_a_point_and_tight_near_it(roads: Any, settings: dict[str, Any]):
     agent, scale = make(**settings), feature_scale(3) * torch.tensor([0.0, 1, 1, 1, 1])
     obs, bounds = roads(4)[:, :6], Bounds(agent.network)
     q = agent.network(obs).double()
@@ -104,7 +112,7 @@ def test_linear_bounds_from_the_back_are_the_networks_own_slopes_where_no_relu_t
     assert torch.allclose(value[:, 0] - least[:, 0], 1e-9 * slope.abs().sum(1), rtol=1e-4, atol=1e-15)
 
 
-def test_the_filters_room_lies_below_what_a_smaller_box_says_anywhere_around(roads):
+def test_the_filters_room_lies_below_what_a_smaller_box_says_anywhere_around(roads: Any):
     rng, obs = np.random.default_rng(0), roads(300).double().numpy()
     obs[:, 1:, 1] = obs[:, :1, 1] + rng.uniform(-200, 200, (300, 14)) * obs[:, 1:, 0]
     size = np.array([0, 4, 0.3, 1, 1])
@@ -118,6 +126,57 @@ def test_the_filters_room_lies_below_what_a_smaller_box_says_anywhere_around(roa
             assert (room <= most + 1e-6).all()
 
 
+def _memory_of(agent: QAgent) -> Memory:
+    assert agent.network.memory is not None
+    return agent.network.memory
+
+
+def remembering(**settings: Any) -> QAgent:
+    """A pupil whose memory says something."""
+    agent = make(kind="rapid", memory=True, **settings)
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        torch.nn.init.normal_(_memory_of(agent).out.weight, std=0.3)
+    return agent
+
+
+@pytest.mark.parametrize("settings", [{}, {"action_token": "ego", "num_policies": 3, "top_k": 2}], ids=str)
+def test_bounds_hold_through_a_memory_whose_state_is_known(roads: Any, settings: dict[str, Any]):
+    agent, scale = remembering(**settings), feature_scale(3) * torch.tensor([0.0, 1, 1, 1, 1])
+    obs, bounds = roads(4, absent=0.4)[:, :6], Bounds(agent.network)
+    state = agent.start(4)
+    for action in (FASTER, LANE_RIGHT, SLOWER):
+        state = agent.remember(state, np.full(4, action))
+    state = torch.from_numpy(state)
+    # The ego at the edges of what it knows of itself, within, and far beyond.
+    place = _memory_of(agent).start_x + state[0, DISTANCE]
+    obs[:, 0, 1] = place + torch.tensor([5.5, -5.5 - 0.4 * 3, 0.0, 30.0])
+    obs[:, 0, 3] = state[0, SPEED] - torch.tensor([0.0, 1.5, 0.5, 8.0])
+    q = agent.network(obs, state).double()
+    exact = bounds.differences(obs, obs, state)
+    assert torch.allclose(exact, q[:, :, None] - q[:, None], atol=2e-5)
+    for radius in (1e-5, 5e-4, 5e-3):
+        least = bounds.differences(obs - radius * scale, obs + radius * scale, state)
+        assert radius > 1e-4 or not least.isnan().any()
+        for index in range(4):
+            points = obs[index] + offsets(800, 6, index) * (scale * radius * 0.99999)
+            q = agent.network(points, state[index].expand(800, -1)).double()
+            found = (q[:, :, None] - q[:, None]).amin(0)
+            assert bool(((found >= least[index] - 2e-5) | least[index].isnan()).all())
+
+
+def test_a_certified_return_of_who_remembers_is_exact_without_a_radius_and_holds_with_one():
+    agent, seed = remembering(), spawn_seeds("tune", 1)[0]
+    exact = certified_return(agent, SCENARIO, seed, 0.0)
+    assert exact.complete
+    assert exact.least == pytest.approx(exact.clean)
+    wide = certified_return(agent, SCENARIO, seed, 2e-4, width=4)
+    attacked = run_episodes(agent, SCENARIO, [seed], "pgd:steps=20,radius=0.0002")
+    assert wide.least <= min(exact.least, attacked.return_E[0]) + 1e-9
+    (rate,) = decision_rates(agent, SCENARIO, [seed], (0.0,), 4)
+    assert rate.unchanged.value == 1
+
+
 @pytest.fixture(scope="module")
 def decisions():
     from rapid.certify.rate import decisions_of
@@ -127,7 +186,7 @@ def decisions():
 
 @pytest.mark.parametrize("shield", ["", "0", "0.005"])
 @pytest.mark.parametrize("settings", [NETWORKS[0], NETWORKS[3]], ids=str)
-def test_no_attack_brings_about_an_action_that_is_ruled_out(decisions, settings, shield):
+def test_no_attack_brings_about_an_action_that_is_ruled_out(decisions: Any, settings: dict[str, Any], shield: str):
     agent = make(**settings) if not shield else shielded(make(**settings), shield, 3)
     for radius in (5e-4, 5e-3):
         may = Reach(agent, radius).actions(decisions)
@@ -163,18 +222,23 @@ def test_a_certified_return_is_what_is_earned_without_attack_and_less_with_a_rad
     assert wide.least <= exact.least
     attacked = run_episodes(agent, SCENARIO, [seed], "pgd:steps=20,radius=0.001")
     assert wide.least <= attacked.return_E[0] + 1e-9
-    narrow = certified_return(agent, SCENARIO, seed, 0.1, width=1)
-    assert not narrow.complete
-    assert narrow.least < exact.least
+    # Beyond the filter's box a crash in the first step is in reach, and nobody earns less.
+    beyond = certified_return(agent, SCENARIO, seed, 0.1)
+    assert beyond.complete
+    assert not beyond.crash_free
+    assert beyond.least < 2
+    cut = certified_return(agent, SCENARIO, seed, 0.0, width=0)
+    assert not cut.complete
+    assert cut.least == 0
 
 
-def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path, capsys):
+def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path: Path, capsys: Any):
     save_agent(tmp_path / "agent", careful().network, {"name": "pupil", "scenario": SCENARIO})
 
     def call(*words: str) -> int:
         with pytest.raises(SystemExit) as ended:
             main(["certify", *words, "--out", str(tmp_path / "out")])
-        return ended.value.code
+        return int(ended.value.code or 0)
 
     small = ("--decisions", "12", "--spawns", "3", "--returns", "1", "--radii", "0.000001", "0.001")
     assert call(f"shield:0.01:{tmp_path}/agent", *small) == 0
@@ -211,8 +275,6 @@ def test_what_cannot_be_certified_is_refused():
             Reach(agent, radius)
     with pytest.raises(RapidError, match="no network whose bounds"):
         Reach(open_agent("slower", SCENARIO), 0.01)
-    with pytest.raises(RapidError, match="memory"):
-        Reach(make(kind="rapid", memory=True), 0.01)
     with pytest.raises(RapidError, match="never negative"):
         certified_return(agent, f"{SCENARIO}:progress", 0, 0.01)
     with pytest.raises(RapidError, match="at least one decision"):
@@ -221,7 +283,7 @@ def test_what_cannot_be_certified_is_refused():
 
 def test_who_always_brakes_is_proven_to():
     agent = make(kind="mlp")
-    last = [layer for layer in agent.network.head.mlps[0] if isinstance(layer, torch.nn.Linear)][-1]
+    last = [layer for layer in _perceptron_of(agent) if isinstance(layer, torch.nn.Linear)][-1]
     last.weight.zero_()
     last.bias.copy_(torch.eye(5)[SLOWER])
     (rate,) = decision_rates(agent, SCENARIO, spawn_seeds("tune", 2), (0.1,), 20)

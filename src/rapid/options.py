@@ -180,7 +180,8 @@ class Evaluate:
     agents: Annotated[Positional[tuple[str, ...]], arg(metavar="AGENT ...")]
     """Directories of agents, ONNX files, and drivers by name, each with shield:BOX: before it if it is to drive behind
     the interval filter (shield:0.1:slower): slower, idle, faster, random, rule, rule-forecast, rule-foresight,
-    uniform-safe, immune, blind, planner, planner-cars, planner-observation, teacher (the one of --config)."""
+    uniform-safe, immune, blind, planner, planner-cars, planner-observation, teacher (the one of --config). A defence
+    without training goes before those with Q-values (smooth:3:AGENT; docs/defences.md)."""
     evaluate: Flat[EvaluateConfig] = field(default_factory=EvaluateConfig)
     scenario: str = ""
     """Where they drive; by default where the saved agents were trained, else in lane-3-density-2."""

@@ -43,7 +43,7 @@ class Certify:
     """Prove what no attack within a radius can do: change a decision, make it unsafe, lower the return further.
 
     Sound bounds through the network as it was trained, not an attack: what is not proven need not be false. For agents
-    with a network and no memory; attacks leave presence alone.
+    with a network; attacks leave presence alone.
     """
 
     agent: Annotated[Positional[str], arg(metavar="AGENT")]
@@ -56,6 +56,8 @@ class Certify:
     """Test spawns, on the way through which the agent decides."""
     returns: SideOrNone = 0
     """Of how many of them the return is bounded too, by the tree of all actions that an attack may bring about."""
+    width: Positive = 256
+    """Worlds of a tree that are followed side by side; where more differ, what is left counts as nothing."""
     scenario: str = ""
     """Where it drives; by default where it was trained."""
     out: str = "certificate"

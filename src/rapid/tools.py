@@ -55,7 +55,7 @@ def certify(options: Certify, config: Config) -> int:
     out, counts = Path(options.out), (options.decisions, options.spawns, options.returns)
     with exclusive_file(out / "certificate.json"):
         check_new_file(out / "certificate.json", options.force)
-        print(certify(agent, config.scenario, options.radii, *counts, out), end="")
+        print(certify(agent, config.scenario, options.radii, *counts, out, options.width), end="")
     return 0
 
 

@@ -17,6 +17,7 @@ from rapid.certify.forms import Form, affine, averaged, between, joined, layer_n
 from rapid.errors import RapidError
 from rapid.networks.blocks import Block, Transformer
 from rapid.networks.encoding import BESIDE, NEAR, Encoding
+from rapid.networks.memory import Memory
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.mlp import MlpHead
 from rapid.networks.q_network import MIRRORED_ACTIONS, QNetwork, TokenHead
@@ -34,31 +35,30 @@ class Bounds:
     """Lower bounds of the differences of a network's Q-values; its safety filter, if any, is left out.
 
     Args:
-        network: any network without a memory; it is copied.
+        network: any network; it is copied.
 
     Raises:
-        RapidError: the network is a stack or has a memory.
+        RapidError: the network is a stack.
     """
 
     def __init__(self, network: QNetwork) -> None:
-        if network.is_stack or getattr(network, "memory", None) is not None:
-            raise RapidError(
-                "Bounds are computed for one network that decides by what it sees alone. This one is a stack, or has a "
-                "memory (network.memory): certify an agent without."
-            )
+        if network.is_stack:
+            raise RapidError("Bounds are computed for one network. This one is a stack of several.")
         self.network = copy.deepcopy(network).double().cpu().requires_grad_(False)
 
     @torch.no_grad()
-    def differences(self, low_BVF: Tensor, high_BVF: Tensor) -> Tensor:
+    def differences(self, low_BVF: Tensor, high_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
         """Return (B, A, A): entry (i, j) is at most q_i - q_j wherever the observation lies in the box.
 
-        Presence, rounded, counts as what it is in the middle of the box. Where a bound overflows it is NaN.
+        Presence, rounded, counts as what it is in the middle of the box. What a network remembers is known. Where a
+        bound overflows it is NaN.
         """
         chunk = CHUNK_TOKENS if isinstance(self.network.head, TokenHead) else CHUNK_PERCEPTRON
-        parts = zip(low_BVF.double().cpu().split(chunk), high_BVF.double().cpu().split(chunk), strict=True)
-        return torch.cat([self._differences(low, high) for low, high in parts])
+        state_BS = low_BVF.new_zeros(len(low_BVF), 0) if state_BS is None else state_BS
+        parts = (each.double().cpu().split(chunk) for each in (low_BVF, high_BVF, state_BS))
+        return torch.cat([self._differences(*part) for part in zip(*parts, strict=True)])
 
-    def _differences(self, low_BVF: Tensor, high_BVF: Tensor) -> Tensor:
+    def _differences(self, low_BVF: Tensor, high_BVF: Tensor, state_BS: Tensor) -> Tensor:
         encoding = self.network.encoding
         radius_BVF = (high_BVF - low_BVF) / 2
         errors = radius_BVF[0].numel()
@@ -66,6 +66,9 @@ class Bounds:
         each = torch.eye(errors, dtype=torch.float64).view(errors, 1, *radius_BVF.shape[1:])
         seen = Form((low_BVF + high_BVF) / 2, each * radius_BVF, torch.zeros_like(radius_BVF))
         present_BV1 = seen.centre[..., :1] > encoding.absent_V1
+        memory = self.network.memory
+        if memory is not None:
+            return self._of_road(_believed(memory, seen, state_BS), present_BV1, _recalled(memory, seen, state_BS))
         least_BAA = self._of_road(seen, present_BV1)
         if self.network.config.mirror:
             turned = seen.scaled(encoding.turned_F).plus(encoding.far_side_F)
@@ -74,7 +77,7 @@ class Bounds:
             least_BAA = (least_BAA + self._of_road(turned, present_BV1)[:, order][:, :, order]) / 2
         return least_BAA
 
-    def _of_road(self, seen: Form, present_BV1: Tensor) -> Tensor:
+    def _of_road(self, seen: Form, present_BV1: Tensor, recalled: list[Form] | None = None) -> Tensor:
         encoding, head = self.network.encoding, self.network.head
         features = _features(encoding, seen)
         if encoding.mask_absent:
@@ -84,7 +87,7 @@ class Bounds:
         one_AA = torch.eye(NUM_ACTIONS, dtype=torch.float64)
         pairs_PA = (one_AA[:, None] - one_AA).flatten(0, 1)
         if isinstance(head, TokenHead):
-            least_BP = _tokens(head, features, present_BV1[..., 0], pairs_PA)
+            least_BP = _tokens(head, features, present_BV1[..., 0], pairs_PA, recalled or [])
         else:
             assert isinstance(head, MlpHead)
             weights_N = [1.0] if head.weights_N is None else head.weights_N.tolist()
@@ -127,6 +130,38 @@ def perceptron(layers: list[nn.Linear], inside: Form, wanted_PA: Tensor) -> Tens
     return torch.maximum(by_forms, rest_BP + middle_BP - swing_BP - slack_BP)
 
 
+def _believed(memory: Memory, seen: Form, state_BS: Tensor) -> Form:
+    """Return what is seen with the ego's own row within what is known of it."""
+    infinite_BVF = torch.full_like(seen.centre, torch.inf)
+    lowest_BF, highest_BF = (memory.believed(each, state_BS)[:, 0] for each in (-infinite_BVF, infinite_BVF))
+    rows: list[Form] = []
+    for feature in range(seen.centre.shape[-1]):
+        entry = seen.map(lambda part, i=feature: part[..., :1, i : i + 1])
+        low_B, high_B = lowest_BF[:, feature], highest_BF[:, feature]
+        if bool(low_B.isfinite().all()):
+            least_B11 = low_B[:, None, None]
+            entry = entry.plus(-least_B11).relu().plus(least_B11)
+        if bool(high_B.isfinite().all()):
+            most_B11 = high_B[:, None, None]
+            entry = entry.scaled(-1.0).plus(most_B11).relu().scaled(-1.0).plus(most_B11)
+        rows.append(entry)
+    return joined([joined(rows, -1), seen.map(lambda part: part[..., 1:, :])], -2)
+
+
+def _recalled(memory: Memory, seen: Form, state_BS: Tensor) -> list[Form]:
+    """Return what memory adds to the adapters' tokens, to the token that is read, and to the router, each (B, 1, D)."""
+    # What is known is linear in what is seen of the ego, presence apart, which is that of the middle.
+    known_BM = memory.knowledge(seen.centre, state_BS)
+    moved_EBM = torch.stack([memory.knowledge(seen.centre + part, state_BS) - known_BM for part in seen.linear])
+    known = Form(known_BM[:, None], moved_EBM[:, :, None], torch.zeros_like(known_BM[:, None]))
+    added = affine(linear(known, memory.hidden).relu(), memory.out.weight)
+    starts = [sum(memory.sizes[:place]) for place in range(len(memory.sizes))]
+    return [
+        added.map(lambda part, first=first, size=size: part[..., first : first + size])
+        for first, size in zip(starts, memory.sizes, strict=True)
+    ]
+
+
 def _features(encoding: Encoding, seen: Form) -> Form:
     if encoding.kind == "raw":
         return seen
@@ -152,23 +187,30 @@ def _features(encoding: Encoding, seen: Form) -> Form:
     return joined([scaled, share, beside, closing], -1)
 
 
-def _tokens(head: TokenHead, features: Form, seen_BV: Tensor, pairs_PA: Tensor) -> Tensor:
-    tokens, decoder = _mixture(head.mixture, features, seen_BV), head.decoder
+def _tokens(head: TokenHead, features: Form, seen_BV: Tensor, pairs_PA: Tensor, recalled: list[Form]) -> Tensor:
+    tokens, decoder = _mixture(head.mixture, features, seen_BV, recalled), head.decoder
+    action = [each.padded(len(tokens.linear)) for each in recalled[1:2]]
     if decoder.action_token is not None:
         first = decoder.action_token.expand(len(seen_BV), -1, -1)
-        tokens = joined([between(first, first, len(tokens.linear)), tokens], -2)
+        read = between(first, first, len(tokens.linear))
+        tokens = joined([read.plus(action[0]) if action else read, tokens], -2)
         seen_BV = torch.cat([torch.ones_like(seen_BV[:, :1]), seen_BV], 1)
+    elif action:
+        ego, others = (tokens.map(lambda part, i=i: part[..., i, :]) for i in (slice(0, 1), slice(1, None)))
+        tokens = joined([ego.plus(action[0]), others], -2)
     read = _transformer(decoder.transformer, tokens, seen_BV, first_only=True)
     return affine(read, pairs_PA @ decoder.head.weight, pairs_PA @ decoder.head.bias).low[:, 0]
 
 
-def _mixture(mixture: MixtureOfPolicies, features: Form, seen_BV: Tensor) -> Form:
+def _mixture(mixture: MixtureOfPolicies, features: Form, seen_BV: Tensor, recalled: list[Form]) -> Form:
     policies = [cast(PolicyEncoder, policy) for policy in mixture.policies]
     total = _policy(policies[0], features, seen_BV)
     if mixture.router is None:
         return total
     into, _, out = mixture.router
     scores = linear(linear(features, cast(nn.Linear, into)).relu(), cast(nn.Linear, out))
+    if recalled:
+        scores = scores.plus(recalled[2])
     if mixture.top_k < len(policies):
         omega = _among_the_best(scores, mixture.top_k)
     else:
@@ -184,7 +226,7 @@ def _mixture(mixture: MixtureOfPolicies, features: Form, seen_BV: Tensor) -> For
         if bool(gate_VN[:, index].any()):
             weight = weights.map(lambda part, i=index: part[..., i : i + 1])
             # Its new errors come behind those of the policies before.
-            total = total.plus(_policy(policy, features.padded(len(total.linear)), seen_BV).times(weight))
+            total = total.plus(_policy(policy, features.padded(len(total.linear)), seen_BV, recalled).times(weight))
     return total.named()
 
 
@@ -210,8 +252,10 @@ def _among_the_best(scores: Form, top_k: int) -> Form:
     return Form(*(torch.where(certain, sharp, wide) for sharp, wide in zip(shares, loose, strict=True)))
 
 
-def _policy(policy: PolicyEncoder, features: Form, seen_BV: Tensor) -> Form:
+def _policy(policy: PolicyEncoder, features: Form, seen_BV: Tensor, recalled: list[Form] | None = None) -> Form:
     tokens = linear(features, policy.projection)
+    if recalled:
+        tokens = tokens.plus(recalled[0])
     if policy.position is not None:
         rows = policy.position.shape[0]
         tokens = tokens.plus(nn.functional.pad(policy.position, (0, 0, 0, seen_BV.shape[1] - rows)))

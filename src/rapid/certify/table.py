@@ -15,18 +15,26 @@ from rapid.spawns import spawn_seeds
 
 
 def certify(
-    agent: QAgent, scenario: str, radii: Sequence[float], decisions: int, spawns: int, returns: int, out: Path
+    agent: QAgent,
+    scenario: str,
+    radii: Sequence[float],
+    decisions: int,
+    spawns: int,
+    returns: int,
+    out: Path,
+    width: int = 256,
 ) -> str:
     """Certify decisions and returns of an agent and write ``certificate.txt`` and ``certificate.json`` to `out`.
 
     Args:
-        agent: an agent with a network and no memory.
+        agent: an agent with a network.
         scenario: where it drives.
         radii: of the attacks, in features scaled to +-1.
         decisions: how many are certified for each radius, from as many episodes as there are `spawns`.
         spawns: test spawns.
         returns: of how many of them the return is bounded too, for each radius; 0 is none.
         out: the directory.
+        width: of the trees; see :func:`rapid.certify.rate.certified_return`.
 
     Returns:
         The table.
@@ -50,7 +58,7 @@ def certify(
         for radius in radii if returns else ():
             found[radius] = []
             for seed in seeds[:returns]:
-                found[radius].append(certified_return(agent, scenario, seed, radius))
+                found[radius].append(certified_return(agent, scenario, seed, radius, width))
                 work.advance()
     table = _table(agent, scenario, rates, found)
     files.write_text(out / "certificate.txt", table)
@@ -60,6 +68,7 @@ def certify(
             "agent": agent.name,
             "scenario": scenario,
             "shield": agent.network.config.shield,
+            "width": width,
             "decisions": [asdict(rate) for rate in rates],
             "returns": [{"radius": radius, **asdict(one)} for radius, all_ in found.items() for one in all_],
         },
