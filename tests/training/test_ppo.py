@@ -13,7 +13,7 @@ from rapid.agents.saved import QAgent
 from rapid.config import AdaptConfig, AdversaryConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
-from rapid.networks.q_network import set_phase
+from rapid.networks.q_network import QNetwork, set_phase
 from rapid.scenarios import FASTER
 from rapid.simulator import make_vec
 from rapid.training import adapt_by_ppo, ppo
@@ -146,6 +146,16 @@ def test_the_distilled_policy_stays_bit_equal_and_the_gate_opens(tmp_path):
     assert lines(tmp_path)[-1]["gate"] > 0
 
 
+def test_the_frozen_policys_tokens_are_computed_once_a_rollout_and_change_no_bit(tmp_path, monkeypatch):
+    net, calls = network(), []
+    net.head.mixture.policies[0].register_forward_hook(lambda *_: calls.append(1))
+    kept = train(tmp_path / "kept", net=net)
+    # Four rollouts of eight decisions; three minibatches of each but the critic's own, for both passes.
+    assert len(calls) == 4 * 8 + 3 * 3
+    monkeypatch.setattr(QNetwork, "frozen_tokens", lambda *_: None)
+    assert weights(train(tmp_path / "anew")) == weights(kept)
+
+
 def test_the_policy_waits_until_the_critic_has_learned(tmp_path):
     seen = []
     patient = replace(CONFIG, evaluate_every=24, ppo=replace(PPO, critic_steps=60))
@@ -185,10 +195,10 @@ def test_the_clock_is_kept_from_the_policy_wherever_the_scenario_does(tmp_path, 
             told.append(obs_BVF[:, 0, 0])
             return super().values(obs_BVF)
 
-        def log_probs(self, seen_BVF, state_BS=None):
+        def log_probs(self, seen_BVF, state_BS=None, first_BVD=None):
             handle = self.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][:, 0, 0]))
             try:
-                return super().log_probs(seen_BVF, state_BS)
+                return super().log_probs(seen_BVF, state_BS, first_BVD)
             finally:
                 handle.remove()
 

@@ -64,18 +64,28 @@ class MixtureOfPolicies(nn.Module):
         self.stays_closed = False
         """Whether the gate is 0 and is not trained. A recording on a GPU, which cannot look, goes by it."""
 
-    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None) -> Tensor:
-        """Return the mixed tokens (B, V, D); memory reaches the router and, of the policies, the adapters."""
+    def forward(
+        self,
+        features_BVF: Tensor,
+        mask_B11V: Tensor | None,
+        recalled: Recalled | None = None,
+        first_BVD: Tensor | None = None,
+    ) -> Tensor:
+        """Return the mixed tokens (B, V, D); memory reaches the router and, of the policies, the adapters.
+
+        Whoever has policy 1's tokens already gives them as `first_BVD`.
+        """
+        if first_BVD is None:
+            first_BVD = cast(Tensor, self.policies[0](features_BVF, mask_B11V))
         if self.router is None:
-            return self.policies[0](features_BVF, mask_B11V)
+            return first_BVD
         router_BVN, weights_BVN = self.weights(features_BVF, recalled)
-        mixed_BVD: Tensor | None = None
+        mixed_BVD = weights_BVN[..., 0, None] * first_BVD
+        token_BD = None if recalled is None else recalled.token_BD
         for index, policy in enumerate(self.policies):
-            if self._runs(index, router_BVN):
-                token_BD = recalled.token_BD if recalled is not None and index else None
-                part_BVD = weights_BVN[..., index, None] * policy(features_BVF, mask_B11V, token_BD)
-                mixed_BVD = part_BVD if mixed_BVD is None else mixed_BVD + part_BVD
-        return cast(Tensor, mixed_BVD)
+            if index and self._runs(index, router_BVN):
+                mixed_BVD = mixed_BVD + weights_BVN[..., index, None] * policy(features_BVF, mask_B11V, token_BD)
+        return mixed_BVD
 
     def weights(self, features_BVF: Tensor, recalled: Recalled | None = None) -> tuple[Tensor, Tensor]:
         """Return the router's softmaxed weights and the signed weights after the gate, both (B, V, N)."""
@@ -100,9 +110,7 @@ class MixtureOfPolicies(nn.Module):
         return router_BVN, torch.cat([first_BV1, adapters_BVN], -1)
 
     def _runs(self, index: int, router_BVN: Tensor) -> bool:
-        """Whether the policy can change the output or a gradient; if not, leaving it out changes no bit."""
-        if index == 0:
-            return True
+        """Whether the adapter can change the output or a gradient; if not, leaving it out changes no bit."""
         if router_BVN.is_cuda and torch.cuda.is_current_stream_capturing():
             # A recording cannot ask for values, and is replayed with others.
             return not self.stays_closed

@@ -90,11 +90,16 @@ class TokenHead(nn.Module):
         self.mixture = MixtureOfPolicies(config, config.num_policies if config.kind == "rapid" else 1)
         self.decoder = ActionDecoder(config)
 
-    def forward(self, features_BVF: Tensor, mask_B11V: Tensor | None, recalled: Recalled | None = None) -> Tensor:
-        """Return the Q-values (B, A)."""
-        if recalled is None:
-            return self.decoder(self.mixture(features_BVF, mask_B11V), mask_B11V)
-        return self.decoder(self.mixture(features_BVF, mask_B11V, recalled), mask_B11V, recalled.action_BD)
+    def forward(
+        self,
+        features_BVF: Tensor,
+        mask_B11V: Tensor | None,
+        recalled: Recalled | None = None,
+        first_BVD: Tensor | None = None,
+    ) -> Tensor:
+        """Return the Q-values (B, A); whoever has policy 1's tokens already gives them as `first_BVD`."""
+        tokens_BVD = self.mixture(features_BVF, mask_B11V, recalled, first_BVD)
+        return self.decoder(tokens_BVD, mask_B11V, None if recalled is None else recalled.action_BD)
 
 
 class QNetwork(nn.Module):
@@ -140,10 +145,13 @@ class QNetwork(nn.Module):
         head = self.head
         return head.mixture.gate_NV if isinstance(head, TokenHead) else head.weights_N
 
-    def forward(self, obs_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
+    def forward(self, obs_BVF: Tensor, state_BS: Tensor | None = None, first_BVD: Tensor | None = None) -> Tensor:
         """Return the Q-values (B, A).
 
-        A network with a memory is told its state (:mod:`rapid.networks.memory`).
+        Args:
+            obs_BVF: raw observations.
+            state_BS: the state of a network with a memory (:mod:`rapid.networks.memory`).
+            first_BVD: what :meth:`frozen_tokens` gave for them, which spares policy 1.
 
         Raises:
             RapidError: a state is missing, or is given to a network without a memory.
@@ -156,7 +164,9 @@ class QNetwork(nn.Module):
             )
         if self.memory is not None and state_BS is not None:
             features_BVF, mask_B11V = self.encoding(self.memory.believed(obs_BVF, state_BS))
-            q_BA = cast(TokenHead, self.head)(features_BVF, mask_B11V, self.memory(obs_BVF, state_BS))
+            q_BA = cast(TokenHead, self.head)(features_BVF, mask_B11V, self.memory(obs_BVF, state_BS), first_BVD)
+        elif first_BVD is not None:
+            q_BA = cast(TokenHead, self.head)(*self.encoding(obs_BVF), None, first_BVD)
         else:
             q_BA = self._unfiltered(obs_BVF)
         return self._shielded(q_BA, obs_BVF)
@@ -172,6 +182,23 @@ class QNetwork(nn.Module):
         if not self.config.shield:
             return q_BA
         return filter_values(torch, q_BA, margins(torch, obs_BVF, self.lanes, read_box(self.config.shield, self.lanes)))
+
+    @torch.no_grad()
+    def frozen_tokens(self, obs_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor | None:
+        """Return policy 1's tokens (B, V, D), which no update changes; None where it is trained or there is none.
+
+        None, too, for a network that averages with the mirror image, which needs two of each.
+        """
+        head = self.head
+        if not isinstance(head, TokenHead) or self.config.mirror:
+            return None
+        first = head.mixture.policies[0]
+        if any(parameter.requires_grad for parameter in first.parameters()):
+            return None
+        obs_BVF = with_rows(obs_BVF, self.config.vehicles)
+        if self.memory is not None and state_BS is not None:
+            obs_BVF = self.memory.believed(obs_BVF, state_BS)
+        return first(*self.encoding(obs_BVF))
 
     @torch.no_grad()
     def explain(self, obs_BVF: Tensor, state_BS: Tensor | None = None) -> Explanation:

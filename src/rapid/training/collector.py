@@ -60,19 +60,12 @@ class Rollout(NamedTuple):
     advantage_N: Tensor
     return_N: Tensor
     """The critic's target."""
+    first_NVD: Tensor | None = None
+    """Policy 1's tokens of what was seen, if no update changes them."""
 
     def rows(self, rows_B: Tensor) -> "Rollout":
         """Return some of the transitions."""
-        state_BS = None if self.state_NS is None else self.state_NS[rows_B]
-        return Rollout(
-            self.obs_NVF[rows_B],
-            self.seen_NVF[rows_B],
-            state_BS,
-            self.action_N[rows_B],
-            self.log_prob_N[rows_B],
-            self.advantage_N[rows_B],
-            self.return_N[rows_B],
-        )
+        return Rollout(*(None if tensor is None else tensor[rows_B] for tensor in self))  # pyright: ignore
 
 
 class Collector:

@@ -11,7 +11,7 @@ Shapes: N transitions of a rollout, B a minibatch, V vehicles, F features, S ent
 
 import os
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -187,11 +187,14 @@ class PpoLearner:
 
     def q_values(self, seen_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
         """Return the policy's Q-values (B, A)."""
-        return self.network(seen_BVF) if state_BS is None else self.network(seen_BVF, state_BS)
+        return self.network(seen_BVF, state_BS)
 
-    def log_probs(self, seen_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
-        """Return the policy's log-probabilities (B, A) = log softmax(Q / T) for what it sees and remembers."""
-        return (self.q_values(seen_BVF, state_BS) / self.config.temperature).log_softmax(1)
+    def log_probs(self, seen_BVF: Tensor, state_BS: Tensor | None = None, first_BVD: Tensor | None = None) -> Tensor:
+        """Return the policy's log-probabilities (B, A) = log softmax(Q / T) for what it sees and remembers.
+
+        Policy 1's tokens, if they are given, need not be computed again (:meth:`QNetwork.frozen_tokens`).
+        """
+        return (self.network(seen_BVF, state_BS, first_BVD) / self.config.temperature).log_softmax(1)
 
     def values(self, obs_BVF: Tensor) -> Tensor:
         """Return what the critic expects until the end of the episode (B,)."""
@@ -201,12 +204,20 @@ class PpoLearner:
         """Learn from a rollout: several passes over it in minibatches."""
         rate, count = self.learning_rate, len(rollout.action_N)
         self._far = False
+        if rate:
+            rollout = rollout._replace(first_NVD=self._frozen_tokens(rollout))
         for _ in range(self.config.epochs):
             order_N = torch.from_numpy(self._rng.permutation(count)).to(rollout.obs_NVF.device)
             for rows_B in order_N.split(self.config.batch_size):
                 self._take_step(rollout.rows(rows_B), rate)
                 self.updates += 1
         self.rollouts += 1
+
+    def _frozen_tokens(self, rollout: Rollout) -> Tensor | None:
+        """Return what policy 1 makes of the whole rollout, where it is not trained: it is needed in every pass."""
+        rows = torch.arange(len(rollout.action_N), device=rollout.action_N.device).split(self.config.batch_size)
+        parts = [self.network.frozen_tokens(part.seen_NVF, part.state_NS) for part in map(rollout.rows, rows)]
+        return None if parts[0] is None else torch.cat(cast(list[Tensor], parts))
 
     def _take_step(self, batch: Rollout, rate: float) -> None:
         value = (self.values(batch.obs_NVF) - batch.return_N).div(VALUE_SCALE).square().mean()
@@ -216,7 +227,7 @@ class PpoLearner:
         self._values.append(value.detach())
         if not rate or self._far:
             return
-        log_prob_BA = self.log_probs(batch.seen_NVF, batch.state_NS)
+        log_prob_BA = self.log_probs(batch.seen_NVF, batch.state_NS, batch.first_NVD)
         log_prob_B = log_prob_BA.gather(1, batch.action_N[:, None]).squeeze(1)
         with torch.no_grad():
             moved_B = log_prob_B - batch.log_prob_N
