@@ -155,7 +155,7 @@ def test_policy_1_never_hears_it(observations):
     recalled = network.memory(observations, state)
     first = network.head.mixture.policies[0]
     seen = []
-    handle = first.register_forward_hook(lambda _, inputs, out: seen.append(((*inputs, None)[2], out)))
+    handle = first.register_forward_hook(lambda _, inputs, out: seen.append((len(inputs) > 2 and inputs[2], out)))
     network(observations, state)
     handle.remove()
     ((recalled_by_first, tokens),) = seen

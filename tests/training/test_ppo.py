@@ -1,5 +1,8 @@
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from test_distill import DATA, Killed, lines, network, weights
+from torch import Tensor
 
 from fake_worlds import FakeWorlds
 from rapid.agents.saved import QAgent
@@ -17,7 +21,7 @@ from rapid.networks.q_network import QNetwork, set_phase
 from rapid.scenarios import FASTER
 from rapid.simulator import make_vec
 from rapid.training import adapt_by_ppo, ppo
-from rapid.training.collector import Collector, advantages
+from rapid.training.collector import Collector, Rollout, advantages
 from rapid.training.machinery.diagnostics import Forgetting
 from rapid.training.machinery.worlds import Drive
 from rapid.training.ppo import PpoLearner, without_clock
@@ -51,13 +55,21 @@ def worlds(count: int) -> FakeWorlds:
     return TimedWorlds(count, autoreset=True)
 
 
-def train(directory, config=CONFIG, kind="rapid", seed=3, net=None, make_worlds=worlds, **options):
+def train(
+    directory: Path,
+    config: AdaptConfig = CONFIG,
+    kind: str = "rapid",
+    seed: int = 3,
+    net: QNetwork | None = None,
+    make_worlds: Callable[[int], Any] | None = worlds,
+    **options: Any,
+) -> QNetwork:
     torch.set_num_threads(1)
     net = network(kind) if net is None else net
     return adapt_by_ppo(net, config, SCENARIO, directory, seed, make_worlds=make_worlds, **options)
 
 
-def collect(learner, drive, config):
+def collect(learner: PpoLearner, drive: Drive, config: PpoConfig) -> Rollout:
     """One rollout, as it is at the end of a training."""
     return Collector(drive, config, AdversaryConfig(), learner.network.scale_F, 0, "cpu").collect(learner)
 
@@ -80,7 +92,9 @@ def test_advantages_are_those_counted_by_hand():
     st.floats(0, 1),
     st.floats(-5, 5),
 )
-def test_with_every_trace_kept_an_advantage_is_the_return_less_the_value(steps, discount, last):
+def test_with_every_trace_kept_an_advantage_is_the_return_less_the_value(
+    steps: list[tuple[float, float, bool]], discount: float, last: float
+):
     reward_TW, value_TW, ended_TW = (
         torch.tensor(column, dtype=torch.float64)[:, None] for column in zip(*steps, strict=True)
     )
@@ -110,7 +124,7 @@ def test_the_policy_loss_is_that_counted_by_hand():
 
 
 @pytest.mark.parametrize("kind", ["rapid", "mlp"])
-def test_training_twice_is_bit_equal(tmp_path, kind):
+def test_training_twice_is_bit_equal(tmp_path: Path, kind: str):
     config = CONFIG if kind == "rapid" else replace(CONFIG, train="all")
     first, second = (train(tmp_path / f"{i}", config, kind) for i in (1, 2))
     assert weights(first) == weights(second) != weights(network(kind))
@@ -120,11 +134,11 @@ def test_training_twice_is_bit_equal(tmp_path, kind):
 
 @pytest.mark.parametrize("make_worlds", [worlds, None], ids=["fake", "compiled"])
 @pytest.mark.parametrize("stop", [1, 9, 24])
-def test_resumed_equals_uninterrupted(tmp_path, monkeypatch, stop, make_worlds):
+def test_resumed_equals_uninterrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, make_worlds: Any):
     whole = train(tmp_path / "whole", make_worlds=make_worlds)
-    step, count = PpoLearner._take_step, itertools.count(1)
+    step, count = PpoLearner._take_step, itertools.count(1)  # pyright: ignore[reportPrivateUsage]
 
-    def dying(self, batch, rate):
+    def dying(self: PpoLearner, batch: Rollout, rate: float) -> None:
         if next(count) == stop:
             raise Killed
         return step(self, batch, rate)
@@ -138,7 +152,7 @@ def test_resumed_equals_uninterrupted(tmp_path, monkeypatch, stop, make_worlds):
     assert lines(tmp_path / "cut") == lines(tmp_path / "whole")
 
 
-def test_the_distilled_policy_stays_bit_equal_and_the_gate_opens(tmp_path):
+def test_the_distilled_policy_stays_bit_equal_and_the_gate_opens(tmp_path: Path):
     trained, fresh = train(tmp_path).state_dict(), network().state_dict()
     same = {name for name, value in trained.items() if torch.equal(value, fresh[name])}
     assert {name for name in fresh if "policies.0" in name} <= same
@@ -146,9 +160,11 @@ def test_the_distilled_policy_stays_bit_equal_and_the_gate_opens(tmp_path):
     assert lines(tmp_path)[-1]["gate"] > 0
 
 
-def test_the_frozen_policys_tokens_are_computed_once_a_rollout_and_change_no_bit(tmp_path, monkeypatch):
-    net, calls = network(), []
-    net.head.mixture.policies[0].register_forward_hook(lambda *_: calls.append(1))
+def test_the_frozen_policys_tokens_are_computed_once_a_rollout_and_change_no_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    net, calls = network(), list[int]()
+    cast(Any, net.head.mixture).policies[0].register_forward_hook(lambda *_: calls.append(1))
     kept = train(tmp_path / "kept", net=net)
     # Four rollouts of eight decisions; three minibatches of each but the critic's own, for both passes.
     assert len(calls) == 4 * 8 + 3 * 3
@@ -156,7 +172,7 @@ def test_the_frozen_policys_tokens_are_computed_once_a_rollout_and_change_no_bit
     assert weights(train(tmp_path / "anew")) == weights(kept)
 
 
-def test_the_policy_waits_until_the_critic_has_learned(tmp_path):
+def test_the_policy_waits_until_the_critic_has_learned(tmp_path: Path):
     seen = []
     patient = replace(CONFIG, evaluate_every=24, ppo=replace(PPO, critic_steps=60))
     train(tmp_path, patient, evaluate=lambda net, steps: seen.append(weights(net)) or {})
@@ -187,15 +203,15 @@ def test_only_the_critic_is_told_the_time():
     assert late_BVF[0, 0, 0] == pytest.approx(1.7)
 
 
-def test_the_clock_is_kept_from_the_policy_wherever_the_scenario_does(tmp_path, monkeypatch):
+def test_the_clock_is_kept_from_the_policy_wherever_the_scenario_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     told, seen = [], []
 
     class Watched(PpoLearner):
-        def values(self, obs_BVF):
+        def values(self, obs_BVF: Tensor):
             told.append(obs_BVF[:, 0, 0])
             return super().values(obs_BVF)
 
-        def log_probs(self, seen_BVF, state_BS=None, first_BVD=None):
+        def log_probs(self, seen_BVF: Tensor, state_BS: Tensor | None = None, first_BVD: Tensor | None = None):
             handle = self.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][:, 0, 0]))
             try:
                 return super().log_probs(seen_BVF, state_BS, first_BVD)
@@ -257,7 +273,7 @@ def test_a_crash_costs_more_in_learning_than_in_what_is_reported():
     assert (lost_N > 1).any()
 
 
-def test_it_learns_what_is_paid(tmp_path):
+def test_it_learns_what_is_paid(tmp_path: Path):
     sizes = {"steps": 12_000, "num_envs": 20, "rollout": 15, "batch_size": 100, "learning_rate": 3e-3}
     config = replace(CONFIG, evaluate_every=0, train="all", ppo=replace(PPO, **sizes))
     trained = train(tmp_path, config, net=network("mlp"), make_worlds=lambda count: PaidWorlds(count, True))
@@ -269,7 +285,7 @@ def test_it_learns_what_is_paid(tmp_path):
     assert (trained(obs_BVF).argmax(1) == FASTER).double().mean() > 0.6
 
 
-def test_metrics_go_on_where_q_learning_ended(tmp_path):
+def test_metrics_go_on_where_q_learning_ended(tmp_path: Path):
     seen = []
     forgetting = Forgetting(network(), DATA, 3)
     seldom = replace(CONFIG, evaluate_every=70)
@@ -286,10 +302,12 @@ def test_metrics_go_on_where_q_learning_ended(tmp_path):
     assert lines(tmp_path / "none")[-1]["agreement"] is None
 
 
-def test_what_is_not_finite_stops_it_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch):
+def test_what_is_not_finite_stops_it_and_the_last_good_checkpoint_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     loss, count = ppo.policy_gradient_loss, itertools.count(1)
 
-    def broken(*arguments):
+    def broken(*arguments: Any):
         return loss(*arguments) * (float("nan") if next(count) == 9 else 1)
 
     with monkeypatch.context() as patch:
@@ -300,7 +318,7 @@ def test_what_is_not_finite_stops_it_and_the_last_good_checkpoint_stays(tmp_path
     assert weights(train(tmp_path)) == weights(train(tmp_path / "whole"))
 
 
-def test_an_observation_that_is_not_finite_stops_it(tmp_path):
+def test_an_observation_that_is_not_finite_stops_it(tmp_path: Path):
     class Broken(TimedWorlds):
         def _obs(self):
             obs = super()._obs()
@@ -311,7 +329,7 @@ def test_an_observation_that_is_not_finite_stops_it(tmp_path):
         train(tmp_path, make_worlds=lambda count: Broken(count, autoreset=True))
 
 
-def test_what_does_not_fit_is_refused(tmp_path):
+def test_what_does_not_fit_is_refused(tmp_path: Path):
     train(tmp_path)
     with pytest.raises(RapidError, match=r"other settings: config.ppo.clip: 0.2 there, 0.1 now"):
         train(tmp_path, replace(CONFIG, ppo=replace(PPO, clip=0.1)))

@@ -76,7 +76,7 @@ class MixtureOfPolicies(nn.Module):
         Whoever has policy 1's tokens already gives them as `first_BVD`.
         """
         if first_BVD is None:
-            first_BVD = cast(Tensor, self.policies[0](features_BVF, mask_B11V))
+            first_BVD = cast(Tensor, self.policies[0](features_BVF, mask_B11V, None))
         if self.router is None:
             return first_BVD
         router_BVN, weights_BVN = self.weights(features_BVF, recalled)
