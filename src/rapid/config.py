@@ -441,7 +441,7 @@ class Config:
     """How much is run."""
     plan: Plan = "bold"
     """How phase 3 learns: `printed` as the paper does; `careful` close to the data; `bold` by much exploring; `ppo` so
-    for longer, and then by PPO."""
+    for longer, and then by PPO; `robust` by PPO under attack, with a memory."""
     scenario: str = "lane-3-density-2"
     """Where the data is collected and policies are trained and measured."""
     simulator: Literal["compiled", "highway-env"] = "compiled"

@@ -7,10 +7,11 @@ import pytest
 
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
-from rapid.experiments import tables
+from rapid.experiments import readme, tables
 from rapid.experiments.exhibit import Request
 from rapid.experiments.exhibits import ALL
 from rapid.experiments.figures import Curve, Lines, Point, Router, save
+from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
 from rapid.experiments.paper import PaperResult
 from rapid.experiments.reproduce import open_reproduction, verdicts, write_page
@@ -150,3 +151,43 @@ def test_words_are_those_of_the_presets():
 def test_what_does_not_exist_is_named(ids: tuple[str, ...], recipe: str, scale: str, says: str, tmp_path: Path):
     with pytest.raises(RapidError, match=says):
         open_reproduction(ids, recipe, scale, tmp_path / "store")
+
+
+def test_a_compact_table_has_one_part_for_each_scenario_and_names_what_was_not_measured():
+    found = (entry(rows(20.42, 5), PaperResult(20.42, 2.59)), Entry(failed="not driven"))
+    missing = (Entry(failed="not driven"), Entry(failed="not driven"))
+    table = Table(
+        "attack",
+        "caption",
+        ("scenario", "method"),
+        ("none", "pgd"),
+        ((("lane-3", "A"), found), (("lane-3", "B"), missing), (("lane-4", "A"), found)),
+        ("A note.",),
+    )
+    text = tables.compact(table)
+    assert text.count("| method | none | pgd |") == 2
+    assert "Not measured on lane-3: B." in text
+    assert text.endswith("A note.")
+    (line,) = [line for line in text.split("**lane-4**")[1].splitlines() if line.startswith("| A |")]
+    assert line.startswith("| A | 20.4 [")
+    assert line.endswith("] (.00) *20.4* | – |")
+
+
+def test_who_does_not_look_is_driven_once_and_who_has_no_network_meets_no_gradient():
+    attacks = ("none", "uniform", "gaussian", "fgsm", "pgd")
+    assert [METHODS["blind"].under(attack) for attack in attacks] == ["none"] * 5
+    assert [METHODS["immune"].under(attack) for attack in attacks] == ["none", "uniform", "gaussian", "none", "none"]
+    assert [METHODS["rule"].under(attack) for attack in attacks] == ["none", "uniform", "gaussian", "", ""]
+    assert [METHODS["teacher"].under(attack) for attack in attacks] == ["none", "", "", "", ""]
+    assert [METHODS["rapid"].under(attack) for attack in attacks] == list(attacks)
+
+
+def test_a_page_s_blocks_are_filled_from_the_rows_and_an_unknown_block_is_named(tmp_path: Path):
+    store = Store(tmp_path / "store", [RESULTS / "cells"], RESULTS)
+    page = "before\n<!-- table: teachers:strong -->\nold\n<!-- end -->\nafter\n"
+    once = readme.filled(page, store, Path("page.md"))
+    assert "| teacher (LLM) | 2" in once
+    assert "old" not in once
+    assert readme.filled(once, store, Path("page.md")) == once
+    with pytest.raises(RapidError, match=r"'page.md' has a block 'teacher'; did you mean 'teachers'"):
+        readme.filled(page.replace("teachers:strong", "teacher"), store, Path("page.md"))

@@ -94,26 +94,25 @@ def grid(request: Request, store: Store, scenario: str, method: Method, attacks:
     """Return one row of a table: a method in a scenario under each attack, beside the paper's numbers."""
     entries: list[Entry] = []
     for name in attacks:
-        applicable = method.trained or not method.looks or name in ("none", "uniform", "gaussian")
-        driven = name if method.looks else "none"
-        cells = method_drives(request, method, scenario, (driven,)) if applicable else []
+        driven = method.under(name)
+        cells = method_drives(request, method, scenario, (driven,)) if driven else []
         old = Legacy(request.recipe, method.id, scenario, driven) if request.scale == "full" else None
         rows, why = rows_of(store, cells, old)
         said = paper_result("attack", name, scenario=scenario, method=method.printed) if method.printed else None
-        entries.append(entry(rows, said, why if applicable else "needs a network"))
+        entries.append(entry(rows, said, why if driven else "not attacked"))
     return tuple(entries)
 
 
 def applicable(request: Request, ids: Sequence[str], scenarios: Sequence[str], attacks: Sequence[str]) -> list[Cell]:
-    found: list[Cell] = []
-    for scenario in scenarios:
-        for method in map(METHODS.__getitem__, ids):
-            usable = (
-                attacks if method.trained else [name for name in attacks if name in ("none", "uniform", "gaussian")]
-            )
-            usable = ["none"] if method.kind in ("teacher", "planner") or not method.looks else usable
-            found += method_drives(request, method, scenario, usable)
-    return found
+    """Return the episodes of several methods, each under the attacks that can be made on it."""
+    return [
+        drive
+        for scenario in scenarios
+        for method in map(METHODS.__getitem__, ids)
+        for drive in method_drives(
+            request, method, scenario, list(dict.fromkeys(filter(None, map(method.under, attacks))))
+        )
+    ]
 
 
 def comparison(

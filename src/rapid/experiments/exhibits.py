@@ -61,9 +61,7 @@ BALL = 0.1
 
 def _robust_drives(request: Request, method: Method, scenario: str, attack: str) -> list[Drive]:
     """Episodes under an attack that leaves presence alone, as the suite has it; who does not look drives clean."""
-    seen = attack if method.looks else "none"
-    if method.id == "immune":  # it reads presence alone, which is left alone
-        seen = "none"
+    seen = attack if method.looks == "everything" else "none"
     return [replace(drive, attack=seen) for drive in method_drives(request, method, scenario, ("none",))]
 
 

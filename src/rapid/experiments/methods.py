@@ -81,7 +81,8 @@ class Setting:
                 ppo=small.ppo,
                 learning_starts=min(adapt.learning_starts, effort.steps // 4),
             )
-        adapt = replace(adapt, scenario=self.scenario, evaluate_every=max(1, adapt.steps // CURVE_POINTS))
+        every = max(1, (adapt.steps or adapt.ppo.steps) // CURVE_POINTS)
+        adapt = replace(adapt, scenario=self.scenario, evaluate_every=every)
         return replace(config, scenario=self.scenario, seed=self.seed, distill=distill, adapt=adapt)
 
 
@@ -142,6 +143,20 @@ def rapid(setting: Setting, data: Mix, beta: float | None = None, plan: str = ""
     return Adapt(start, online, setting.scenario, base.adapt, setting.seed, setting.effort.curve_spawns)
 
 
+def robust(setting: Setting) -> Adapt:
+    """Return RAPID adapted under attack; on wider roads it is lane-3's agent, as a network for their lanes.
+
+    Going on under attack there made it worse on tuning spawns (docs/log/robustness.md).
+    """
+    narrow = replace(get_scenario(PAPER_SCENARIOS[0]), reward=get_scenario(setting.scenario).reward).name
+    home = replace(setting, scenario=narrow)
+    agent = rapid(home, _paper_data(home), plan="robust")
+    if setting.scenario == narrow:
+        return agent
+    settings = replace(agent.settings, scenario=setting.scenario, steps=0, ppo=replace(agent.settings.ppo, steps=0))
+    return Adapt(agent, None, setting.scenario, settings, setting.seed)
+
+
 def adapted(
     setting: Setting, data: Mix, plan: str = "", train: Literal["adapter", "all", "scratch"] = "adapter"
 ) -> Adapt:
@@ -194,26 +209,42 @@ class Method:
     agent: Callable[[Setting], Distill | Adapt | Driver]
     printed: str = ""
     """What the paper's tables call it."""
-    looks: bool = True
-    """Whether it looks at the observation; who does not drives the same under every attack."""
+    looks: Literal["everything", "presence", "nothing"] = "everything"
+    """At what of the observation it looks. Who looks at nothing drives the same under every attack; who reads who is
+    present, rounded, the same under gradient attacks, which move presence by less than one half."""
 
     @property
     def trained(self) -> bool:
         """Whether it has training seeds."""
         return self.kind == "learned"
 
+    def under(self, attack: str) -> str:
+        """Return what to drive it under to know what it does under `attack`; empty if it cannot be attacked so.
+
+        Gradient attacks need a network, and nobody attacks what a planner knows.
+        """
+        noise = attack in ("none", "uniform", "gaussian")
+        if self.looks == "nothing" or (self.looks == "presence" and not noise):
+            return "none"
+        if self.kind in ("teacher", "planner") and attack != "none":
+            return ""
+        return attack if self.trained or noise else ""
+
 
 def _driver(
-    name: str, label: str, kind: Literal["floor", "teacher", "planner"] = "floor", looks: bool = True
+    name: str,
+    label: str,
+    kind: Literal["floor", "teacher", "planner"] = "floor",
+    looks: Literal["everything", "presence", "nothing"] = "everything",
 ) -> Method:
     return Method(name, label, kind, lambda setting: Driver(name), looks=looks)
 
 
 FLOORS = (
-    _driver("slower", "always slower", looks=False),
-    _driver("immune", "immune: slower while any car is seen"),
-    _driver("blind", "blind: a fixed plan", looks=False),
-    _driver("random", "random", looks=False),
+    _driver("slower", "always slower", looks="nothing"),
+    _driver("immune", "immune: slower while any car is seen", looks="presence"),
+    _driver("blind", "blind: a fixed plan", looks="nothing"),
+    _driver("random", "random", looks="nothing"),
     _driver("rule", "rule"),
 )
 TEACHER = Method("teacher", "teacher (LLM)", "teacher", lambda setting: the_teacher(setting.scale))
@@ -259,7 +290,7 @@ METHODS: dict[str, Method] = {
             "rapid-robust",
             "RAPID, adapted under attack",
             "learned",
-            lambda s: rapid(s, _paper_data(s), beta=0.0, plan="robust"),
+            robust,
         ),
         Method("mlp-ppo", "MLP, 300K + 700K PPO", "learned", mlp_by_ppo),
         Method("online-ddqn-10k", "online DDQN, 10K", "learned", lambda s: from_scratch(s, "ddqn", "careful")),

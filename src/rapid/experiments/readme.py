@@ -20,7 +20,7 @@ from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import Legacy
 from rapid.experiments.paper import paper_result
 from rapid.experiments.store import Store
-from rapid.experiments.tables import Facts, markdown
+from rapid.experiments.tables import Table, compact, markdown
 from rapid.files import write_text
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
@@ -51,8 +51,8 @@ def works(store: Store) -> str:
         cells: list[str] = []
         for scenario in PAPER_SCENARIOS:
             for attack in ("none", "pgd"):
-                seen = attack if method.looks else "none"
-                if not method.trained and method.looks and attack == "pgd":
+                seen = method.under(attack)
+                if not seen:
                     cells.append("–")
                     continue
                 drives = method_drives(Request("strong", "full"), method, scenario, (seen,))
@@ -68,7 +68,7 @@ def _exhibit(name: str, recipe: str, store: Store) -> str:
     exhibit = ALL[name]
     shown = exhibit.show(Request(recipe, "full"), store, exhibit)
     tables = [each.data() if isinstance(each, Lines | Router) else each for each in shown]
-    parts = [markdown(table) for table in tables if not isinstance(table, Facts) or table.rows]
+    parts = [compact(table) if isinstance(table, Table) else markdown(table) for table in tables if table.rows]
     return "\n\n".join(parts)
 
 

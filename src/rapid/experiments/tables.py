@@ -120,18 +120,50 @@ def text(table: Table | Facts) -> str:
 
 def markdown(table: Table | Facts) -> str:
     """Return a table as Markdown."""
-
-    def line(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(cell.replace("|", "·").replace("\n", "<br>") for cell in cells) + " |"
-
     if isinstance(table, Facts):
         heads, body = list(table.columns), [list(row) for row in table.rows]
     else:
         heads = [*table.heads, *table.columns]
         body = [[*names, *map(_cells, entries)] for names, entries in table.rows]
-    rule = "|" + "---|" * len(heads)
     notes = [f"\n{note}" for note in table.notes]
-    return "\n".join([f"**{table.caption}**", "", line(heads), rule, *map(line, body), *notes])
+    return "\n".join([f"**{table.caption}**", "", *_pipes(heads, body), *notes])
+
+
+def _pipes(heads: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "·").replace("\n", "<br>") for cell in cells) + " |"
+
+    return [line(heads), "|" + "---|" * len(heads), *map(line, body)]
+
+
+def short(each: Entry) -> str:
+    """Return our mean with its interval, the crash share in brackets, and what the paper prints in italics."""
+    said = "" if each.printed is None else f" *{each.printed.mean:.1f}*"
+    if each.mean is None:
+        return f"–{said}"
+    span = "" if np.isnan(each.mean.low) else f" [{each.mean.low:.1f}, {each.mean.high:.1f}]"
+    crash = "" if each.crash is None else f" ({each.crash.value:.2f})".replace("(0.", "(.")
+    return f"{each.mean.value:.1f}{span}{crash}{said}"
+
+
+def compact(table: Table) -> str:
+    """Return a table of scenarios and methods as Markdown that fits a page: one table for each scenario.
+
+    Methods without any episode in a scenario are named below its table.
+    """
+    parts: list[str] = []
+    for scenario in dict.fromkeys(names[0] for names, _ in table.rows):
+        rows = [(names[1:], entries) for names, entries in table.rows if names[0] == scenario]
+        shown = [(names, entries) for names, entries in rows if any(each.mean is not None for each in entries)]
+        missing = [", ".join(names) for names, entries in rows if (names, entries) not in shown]
+        if shown:
+            body = [[*names, *map(short, entries)] for names, entries in shown]
+            parts.append("\n".join([f"**{scenario}**", "", *_pipes([*table.heads[1:], *table.columns], body)]))
+        if missing:
+            parts.append(f"Not measured on {scenario}: {'; '.join(missing)}.")
+    return "\n\n".join([*parts, *table.notes])
 
 
 _LATEX = str.maketrans(
