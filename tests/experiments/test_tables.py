@@ -155,13 +155,14 @@ def test_what_does_not_exist_is_named(ids: tuple[str, ...], recipe: str, scale: 
 
 def test_a_compact_table_has_one_part_for_each_scenario_and_names_what_was_not_measured():
     found = (entry(rows(20.42, 5), PaperResult(20.42, 2.59)), Entry(failed="not driven"))
+    few = (entry(rows(20.42, 1)), Entry(failed="not driven"))
     missing = (Entry(failed="not driven"), Entry(failed="not driven"))
     table = Table(
         "attack",
         "caption",
         ("scenario", "method"),
         ("none", "pgd"),
-        ((("lane-3", "A"), found), (("lane-3", "B"), missing), (("lane-4", "A"), found)),
+        ((("lane-3", "A"), found), (("lane-3", "B"), missing), (("lane-4", "A"), found), (("lane-4", "C"), few)),
         ("A note.",),
     )
     text = tables.compact(table)
@@ -171,6 +172,7 @@ def test_a_compact_table_has_one_part_for_each_scenario_and_names_what_was_not_m
     (line,) = [line for line in text.split("**lane-4**")[1].splitlines() if line.startswith("| A |")]
     assert line.startswith("| A | 20.4 [")
     assert line.endswith("] (.00) *20.4* | – |")
+    assert "| C (1 training) | 20.4 [" in text
 
 
 def test_who_does_not_look_is_driven_once_and_who_has_no_network_meets_no_gradient():

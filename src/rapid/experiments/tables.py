@@ -148,6 +148,12 @@ def short(each: Entry) -> str:
     return f"{each.mean.value:.1f}{span}{crash}{said}"
 
 
+def _few(entries: Sequence[Entry]) -> str:
+    """Return how many trainings a row has, where they are too few for a verdict."""
+    count = max(each.mean.training_seeds for each in entries if each.mean is not None)
+    return f"({count} training{'s' if count > 1 else ''})" if 0 < count < ENOUGH_SEEDS else ""
+
+
 def compact(table: Table) -> str:
     """Return a table of scenarios and methods as Markdown that fits a page: one table for each scenario.
 
@@ -159,7 +165,7 @@ def compact(table: Table) -> str:
         shown = [(names, entries) for names, entries in rows if any(each.mean is not None for each in entries)]
         missing = [", ".join(names) for names, entries in rows if (names, entries) not in shown]
         if shown:
-            body = [[*names, *map(short, entries)] for names, entries in shown]
+            body = [[" ".join(filter(None, (*names, _few(entries)))), *map(short, entries)] for names, entries in shown]
             parts.append("\n".join([f"**{scenario}**", "", *_pipes([*table.heads[1:], *table.columns], body)]))
         if missing:
             parts.append(f"Not measured on {scenario}: {'; '.join(missing)}.")
