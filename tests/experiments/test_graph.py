@@ -13,7 +13,7 @@ import pytest
 from rapid.config import DistillConfig, MixConfig, NetworkConfig
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
-from rapid.experiments import graph
+from rapid.experiments import costs, graph
 from rapid.experiments.cells import Cell, Distill, Drive, Driver, Mix, Shipped, key
 from rapid.experiments.graph import Job, Result, plan, run
 from rapid.experiments.store import DONE, ROWS, Store
@@ -197,3 +197,15 @@ def test_language_models_are_counted_before_anything_is_driven(tmp_path: Path):
     asked = Drive(Driver("teacher", TeacherConfig()), "lane-3-density-2", "none", 10)
     free = Drive(Driver("teacher", TeacherConfig(backend="scripted", model="rule")), "lane-3-density-2", "none", 10)
     assert plan([asked, free], Store(tmp_path)).decisions == 300
+
+
+def test_what_large_experiments_cost_is_predicted_from_the_rates(monkeypatch: pytest.MonkeyPatch):
+    random = "collect/scripted/random/digest"
+    measured = {"seconds": {random: 0.00072, "drive/teacher/none": 0.3}, "bytes": {random: 50.0}}
+    monkeypatch.setattr(costs, "_measured", lambda: measured)
+    trainings, decisions, transitions = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in costs.totals_table().splitlines()[-3:]
+    ]
+    assert trainings[1:] == ["–"] * 5  # rates are missing
+    assert decisions[1:] == ["2.8", "–", "1.4 h", "0.14 h", "0.014 h"]
+    assert transitions[1:] == ["200", "50 GB", "100 h", "10 h", "1 h"]

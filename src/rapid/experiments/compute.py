@@ -13,7 +13,7 @@ import torch
 import rapid
 from rapid.agents.open import open_agent
 from rapid.agents.saved import load_agent, remembers
-from rapid.config import Config
+from rapid.config import Config, NetworkConfig
 from rapid.data.dataset import load_dataset, mix, save_dataset
 from rapid.data.relabel import relabel
 from rapid.errors import RapidError
@@ -229,18 +229,16 @@ def work_of(cell: Cell) -> tuple[str, float]:
         case Distill():
             loss = cell.settings.loss
             robust = f"{loss.robust_on}-{loss.robust.steps}" if loss.robust_weight else "none"
-            size = f"{cell.network.width}x{cell.network.layers}"
-            return f"distill/{cell.network.kind}/{size}/{robust}/{cell.settings.optimizer.batch_size}", float(
-                cell.settings.iterations
-            )
+            batch = cell.settings.optimizer.batch_size
+            return f"distill/{_size(cell.network)}/{robust}/{batch}", float(cell.settings.iterations)
         case Adapt():
             settings = cell.settings
+            attacked = "-attacked" if settings.adversary.gradient_share else ""
+            part = f"ppo{attacked}" if settings.ppo.steps else "q"
             updates = settings.steps * settings.updates_per_step
-            return f"adapt/{_root_kind(cell)}/{'ppo' if settings.ppo.steps else 'q'}", settings.ppo.steps or max(
-                updates, 1.0
-            )
+            return f"adapt/{_size(_root(cell).network)}/{part}", settings.ppo.steps or max(updates, 1.0)
         case Drive():
-            who = cell.agent.name if isinstance(cell.agent, Driver) else _root_kind(cell.agent)
+            who = cell.agent.name if isinstance(cell.agent, Driver) else _size(_root(cell.agent).network)
             return f"drive/{who}/{cell.attack.partition(':')[0]}", float(cell.spawns)
         case Decide():
             return f"decide/{cell.agent.name if isinstance(cell.agent, Driver) else 'policy'}", cell.decisions
@@ -248,7 +246,11 @@ def work_of(cell: Cell) -> tuple[str, float]:
             return kind_of(cell), 1.0
 
 
-def _root_kind(agent: Distill | Adapt | Fresh) -> str:
+def _size(network: NetworkConfig) -> str:
+    return network.kind if network.kind == "mlp" else f"{network.kind}/{network.width}x{network.layers}"
+
+
+def _root(agent: Distill | Adapt | Fresh) -> Distill | Fresh:
     while isinstance(agent, Adapt):
         agent = agent.origin
-    return agent.network.kind
+    return agent

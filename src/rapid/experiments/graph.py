@@ -2,11 +2,8 @@
 
 import tempfile
 import time
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +11,7 @@ from rapid.engines import Engine, run_jobs
 from rapid.errors import RapidError
 from rapid.experiments.cells import Cell, Collect, Decide, Drive, Driver, Shipped, inputs, key, kind_of, title
 from rapid.experiments.compute import compute, work_of
+from rapid.experiments.costs import rates
 from rapid.experiments.store import Store, files_of, unpack
 from rapid.locks import BusyError
 from rapid.progress import quiet, task
@@ -224,13 +222,6 @@ def do(job: Job, report: Callable[[Any], None]) -> Result:
         return Result(time.monotonic() - start, None, f"The system refused: {error}. Make room or check permissions.")
     except Exception as error:  # a fault of the program in one cell is no reason to lose the others
         return Result(time.monotonic() - start, None, f"{type(error).__name__}: {error}")
-
-
-@cache
-def rates() -> dict[str, float]:
-    """Return seconds per unit of work, as measured (``rates.toml``), by the names of :func:`work_of`."""
-    text = resources.files("rapid.experiments").joinpath("rates.toml").read_text(encoding="utf-8")
-    return {name: float(value) for name, value in tomllib.loads(text)["seconds"].items()}
 
 
 def _decisions(cell: Cell) -> int:

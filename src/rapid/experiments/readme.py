@@ -13,6 +13,7 @@ import numpy as np
 
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import EpisodeRow, column
+from rapid.experiments.costs import rates_table, totals_table
 from rapid.experiments.exhibit import Request, method_drives, rows_of
 from rapid.experiments.exhibits import ALL
 from rapid.experiments.figures import Lines, Router
@@ -72,7 +73,11 @@ def _exhibit(name: str, recipe: str, store: Store) -> str:
     return "\n\n".join(parts)
 
 
-BLOCKS: dict[str, Callable[[Store], str]] = {"works": works}
+BLOCKS: dict[str, Callable[[Store], str]] = {
+    "works": works,
+    "rates": lambda store: rates_table(),
+    "totals": lambda store: totals_table(),
+}
 """Blocks with a form of their own; others are EXHIBIT:RECIPE."""
 
 
