@@ -7,7 +7,7 @@ from importlib import resources
 from rapid.config import TeacherConfig
 from rapid.experiments.cells import Cell, Collect, inputs, key
 from rapid.experiments.compute import work_of
-from rapid.experiments.methods import METHODS, Setting
+from rapid.experiments.methods import Setting, mixture, rapid
 from rapid.experiments.tables import Facts, markdown
 from rapid.scenarios import PAPER_SCENARIOS
 
@@ -51,7 +51,8 @@ def rates_table() -> str:
 
 def totals_table() -> str:
     """Return what three large experiments come to, as Markdown, divided evenly among machines."""
-    training = METHODS["rapid"].agent(Setting("strong", "full", PAPER_SCENARIOS[0]))
+    setting = Setting("strong", "full", PAPER_SCENARIOS[0])
+    training = rapid(setting, mixture(setting))
     random = Collect(PAPER_SCENARIOS[0], TeacherConfig(backend="scripted", model="random"), 1)
     wanted = (
         ("1,000 trainings of RAPID, recipe `strong`", 1e3, _cost(training)),
