@@ -152,12 +152,14 @@ def run(
         finally:
             claim.__exit__(None, None, None)
 
+    predictable = all(work_of(cell)[0] in rate for cell in todo)
+
     def weight(cell: Cell) -> float:
         name, amount = work_of(cell)
-        return max(amount * rate.get(name, 0.0), 1.0)
+        return max(amount * rate[name], 1.0) if predictable else 1.0
 
-    total = sum(map(weight, todo))
-    with task("reproduce", total, "s of work, as predicted") as work:
+    total, unit = sum(map(weight, todo)), "s of work, as predicted" if predictable else "parts"
+    with task("reproduce", total, unit) as work:
         try:
             while left or running:
                 before = len(left)
