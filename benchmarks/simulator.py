@@ -22,7 +22,9 @@ import numpy as np
 from rapid.files import write_json, write_text
 from rapid.progress import task
 from rapid.runs import commit
+from rapid.scenarios import get_scenario
 from rapid.simulator.compile import kernel_stamp
+from rapid.simulator.settings import read_settings
 from rapid.simulator.vector_env import CompiledVectorEnv
 from simulator_parts import Contest, first_step, process_throughput
 from simulator_profile import profile
@@ -44,6 +46,13 @@ def processor() -> str:
 def shown(values: Sequence[float], digits: int = 0) -> str:
     """Return the median of some numbers and their range."""
     return f"{np.median(values):,.{digits}f} ({min(values):,.{digits}f} to {max(values):,.{digits}f})"
+
+
+def vehicle_steps(scenario: str) -> int:
+    """Return how many vehicles are moved by a frame in one decision: all of the road, the ego included, each frame."""
+    named = get_scenario(scenario)
+    settings = read_settings(named.config(), named.dynamics)
+    return settings.frames * (settings.traffic + 1)
 
 
 def race(scenario: str, worlds: int, blocks: int, config: dict[str, Any]) -> dict[str, Any]:
@@ -125,12 +134,14 @@ def report(result: dict[str, Any]) -> str:
         "",
         "One process, one thread, CPU time, in turn, block by block. Both sides drive the same worlds from the same "
         "seeds with the same uniformly random actions, go on after every end, and resets count on both. Median "
-        "over the blocks (range). `B = 1` is the Gymnasium environment of one world. `show_trajectories` only draws, "
+        "over the blocks (range). A vehicle-step is one vehicle moved by one frame of the simulation, on one core. "
+        "`B = 1` is the Gymnasium environment of one world. `show_trajectories` only draws, "
         "but highway-env spends time on it; the paper's configuration has it on.",
         "",
         "| scenario | show_trajectories | highway-env, decisions/s | "
-        f"B = {worlds}, decisions/s | ratio | B = 1, decisions/s | ratio | decisions (resets) | rewards differ by |",
-        "|---" * 9 + "|",
+        f"B = {worlds}, decisions/s | vehicle-steps/s | ratio | B = 1, decisions/s | ratio | decisions (resets) "
+        "| rewards differ by |",
+        "|---" * 10 + "|",
     ]
     for run in result["races"]:
         speeds = run["decisions_per_cpu_second"]
@@ -139,6 +150,7 @@ def report(result: dict[str, Any]) -> str:
             "off" if run["config"] else "on",
             shown(speeds["highway-env"], 2),
             shown(speeds["batch"]),
+            f"{np.median(speeds['batch']) * vehicle_steps(run['scenario']) / 1e6:.1f} million",
             f"**{shown(run['ratio_batch'])}**",
             shown(speeds["single"]),
             shown(run["ratio_single"]),
