@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -98,7 +99,9 @@ def compete(plan: str, attack_steps: int, scenario: str) -> None:
     collect, update = clock.timed("driving", collector.collect), clock.timed("forward", learner.update)
     for _ in sys.stdin:
         clock.spent = dict.fromkeys(PARTS, 0.0)
-        update(collect(learner, 1.0))
+        # Earlier programs have no choice of how attention is computed.
+        with learner.computing() if hasattr(learner, "computing") else nullcontext():
+            update(collect(learner, 1.0))
         steps = settings.num_envs * settings.rollout
         weights = network_fingerprint(network)
         print(json.dumps({"steps": steps, "seconds": clock.spent, "weights": weights}), flush=True)

@@ -235,6 +235,7 @@ def _far_sighted(adapt: AdaptConfig) -> AdaptConfig:
         updates_per_step=0.1,
         exploration_share=0.3,
         loss=replace(bold.loss, discount=0.95),
+        ppo=replace(bold.ppo, attention="compiled"),
     )
 
 
@@ -251,7 +252,7 @@ def _under_attack(adapt: AdaptConfig) -> AdaptConfig:
         adapt,
         train="all",
         memory=True,
-        ppo=replace(adapt.ppo, learning_rate=5e-4, entropy=0.003, critic_steps=20_000),
+        ppo=replace(adapt.ppo, learning_rate=5e-4, entropy=0.003, critic_steps=20_000, attention="compiled"),
         adversary=replace(adapt.adversary, gradient_share=0.65, noise_share=0.1, begin=0.35, ramp=0.15),
     )
 

@@ -4,11 +4,15 @@ Shapes: B batch, T tokens, D width, H heads, L layers. A `mask_B11T` is added to
 be read, -inf where not.
 """
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from rapid.networks.attention import attend, can_attend
 
 
 class Block(nn.Module):
@@ -20,6 +24,8 @@ class Block(nn.Module):
     def __init__(self, width: int, heads: int, feedforward: int) -> None:
         super().__init__()
         self.heads = heads
+        self.compiled = False
+        """Whether attention is by :mod:`rapid.networks.attention` where it can be: faster, and rounded otherwise."""
         self.attention_norm = nn.LayerNorm(width)
         self.query_key_value = nn.Linear(width, 3 * width)
         self.attention_out = nn.Linear(width, width)
@@ -38,11 +44,16 @@ class Block(nn.Module):
             mask_B11T: added to the attention scores.
             first_only: whether only the first token is wanted.
         """
-        query, key, value = self._project(rows, length, first_only)
-        attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask_B11T)
-        if first_only:
-            rows = rows.unflatten(0, (-1, length))[:, 0]
-        rows = rows + self.attention_out(attended.transpose(1, 2).reshape(-1, rows.shape[-1]))
+        if self.compiled and not first_only and can_attend(rows, length, self.heads):
+            projected = self.query_key_value(self.attention_norm(rows))
+            attended = attend(projected, length, self.heads, mask_B11T)
+        else:
+            query, key, value = self._project(rows, length, first_only)
+            attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask_B11T)
+            attended = attended.transpose(1, 2).reshape(-1, rows.shape[-1])
+            if first_only:
+                rows = rows.unflatten(0, (-1, length))[:, 0]
+        rows = rows + self.attention_out(attended)
         hidden = functional.relu(self.feedforward_in(self.feedforward_norm(rows)))
         return rows + self.feedforward_out(hidden)
 
@@ -68,6 +79,19 @@ class Block(nn.Module):
         split = rows.view(-1, length, parts, self.heads, rows.shape[-1] // (parts * self.heads))
         # Taken apart before it is transposed, so that the gradient is put together in place, without another copy.
         return tuple(part.transpose(1, 2) for part in split.unbind(2))
+
+
+@contextmanager
+def compiled_attention(*networks: nn.Module) -> Generator[None]:
+    """Let the layers of some networks attend by :mod:`rapid.networks.attention` meanwhile."""
+    blocks = [module for network in networks for module in network.modules() if isinstance(module, Block)]
+    for block in blocks:
+        block.compiled = True
+    try:
+        yield
+    finally:
+        for block in blocks:
+            block.compiled = False
 
 
 class Transformer(nn.Module):

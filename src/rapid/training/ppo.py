@@ -10,6 +10,9 @@ Shapes: N transitions of a rollout, B a minibatch, V vehicles, F features, S ent
 """
 
 import os
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any, cast
 
@@ -21,6 +24,7 @@ from rapid.config import AdaptConfig, NetworkConfig, PpoConfig
 from rapid.config_io import least_steps
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
+from rapid.networks.blocks import compiled_attention
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
@@ -120,7 +124,8 @@ def adapt_by_ppo(
             progress.skip(done * per_rollout)
 
     while done < rollouts:
-        learner.update(collector.collect(learner, done / rollouts))
+        with learner.computing():
+            learner.update(collector.collect(learner, done / rollouts))
         done += 1
         steps, last = before + done * per_rollout, done == rollouts
         row = {
@@ -172,7 +177,6 @@ class PpoLearner:
         self.rollouts = self.updates = 0
         self._values: list[Tensor] = []
         self._terms: list[Tensor] = []
-        self._far = False
 
     @property
     def learning_rate(self) -> float:
@@ -180,6 +184,11 @@ class PpoLearner:
         if self.rollouts * self.config.num_envs * self.config.rollout < self.config.critic_steps:
             return 0.0
         return self.config.learning_rate * max(1 - self.rollouts / self.planned, 0.0)
+
+    def computing(self) -> AbstractContextManager[None]:
+        """Return what driving and learning are done within, so that attention is computed as the settings say."""
+        compiled = self.config.attention == "compiled"
+        return compiled_attention(self.network, self.critic) if compiled else nullcontext()
 
     def as_seen(self, obs_BVF: Tensor) -> Tensor:
         """Return the observations as the policy may see them."""
@@ -201,16 +210,23 @@ class PpoLearner:
         return VALUE_SCALE * self.critic(obs_BVF).mean(1)
 
     def update(self, rollout: Rollout) -> None:
-        """Learn from a rollout: several passes over it in minibatches."""
-        rate, count = self.learning_rate, len(rollout.action_N)
-        self._far = False
-        if rate:
-            rollout = rollout._replace(first_NVD=self._frozen_tokens(rollout))
-        for _ in range(self.config.epochs):
-            order_N = torch.from_numpy(self._rng.permutation(count)).to(rollout.obs_NVF.device)
-            for rows_B in order_N.split(self.config.batch_size):
-                self._take_step(rollout.rows(rows_B), rate)
-                self.updates += 1
+        """Learn from a rollout: several passes over it in minibatches.
+
+        Neither of policy and critic reads what the other learns, so a process that may use several threads gives each
+        one of them; the result is the same, bit for bit.
+        """
+        count, device = len(rollout.action_N), rollout.obs_NVF.device
+        orders = [torch.from_numpy(self._rng.permutation(count)).to(device) for _ in range(self.config.epochs)]
+        minibatches = [rows_B for order_N in orders for rows_B in order_N.split(self.config.batch_size)]
+        if torch.get_num_threads() > 1 and device.type == "cpu":
+            with one_thread_each(), ThreadPoolExecutor(1) as other:
+                critic = other.submit(flush_denormals()(self._teach_critic), rollout, minibatches)
+                self._teach_policy(rollout, minibatches)
+                critic.result()
+        else:
+            self._teach_critic(rollout, minibatches)
+            self._teach_policy(rollout, minibatches)
+        self.updates += len(minibatches)
         self.rollouts += 1
 
     def _frozen_tokens(self, rollout: Rollout) -> Tensor | None:
@@ -219,23 +235,33 @@ class PpoLearner:
         parts = [self.network.frozen_tokens(part.seen_NVF, part.state_NS) for part in map(rollout.rows, rows)]
         return None if parts[0] is None else torch.cat(cast(list[Tensor], parts))
 
-    def _take_step(self, batch: Rollout, rate: float) -> None:
-        value = (self.values(batch.obs_NVF) - batch.return_N).div(VALUE_SCALE).square().mean()
-        gradients = torch.autograd.grad(value, self._critics, materialize_grads=True)
-        clip_norm(gradients, self.config.critic_max_grad_norm)
-        self._critic_adam.step(gradients, self.config.critic_rate)
-        self._values.append(value.detach())
-        if not rate or self._far:
+    def _teach_critic(self, rollout: Rollout, minibatches: list[Tensor]) -> None:
+        for rows_B in minibatches:
+            value_B = self.values(rollout.obs_NVF[rows_B])
+            value = (value_B - rollout.return_N[rows_B]).div(VALUE_SCALE).square().mean()
+            gradients = torch.autograd.grad(value, self._critics, materialize_grads=True)
+            clip_norm(gradients, self.config.critic_max_grad_norm)
+            self._critic_adam.step(gradients, self.config.critic_rate)
+            self._values.append(value.detach())
+
+    def _teach_policy(self, rollout: Rollout, minibatches: list[Tensor]) -> None:
+        rate = self.learning_rate
+        if not rate:
             return
+        rollout = rollout._replace(first_NVD=self._frozen_tokens(rollout))
+        for rows_B in minibatches:
+            if not self._take_step(rollout.rows(rows_B), rate):
+                break
+
+    def _take_step(self, batch: Rollout, rate: float) -> bool:
+        """Move the policy; return whether it may go on, for it is not yet too far from the one that drove."""
         log_prob_BA = self.log_probs(batch.seen_NVF, batch.state_NS, batch.first_NVD)
         log_prob_B = log_prob_BA.gather(1, batch.action_N[:, None]).squeeze(1)
         with torch.no_grad():
             moved_B = log_prob_B - batch.log_prob_N
-            if self.config.largest_kl:
-                # An estimate that is never below 0, of each transition (Schulman, 2020: "Approximating KL divergence").
-                self._far = bool((moved_B.exp() - 1 - moved_B).mean() > self.config.largest_kl)
-                if self._far:
-                    return
+            # An estimate that is never below 0, of each transition (Schulman, 2020: "Approximating KL divergence").
+            if self.config.largest_kl and (moved_B.exp() - 1 - moved_B).mean() > self.config.largest_kl:
+                return False
         policy = policy_gradient_loss(log_prob_B, batch.log_prob_N, batch.advantage_N, self.config.clip)
         entropy = -(log_prob_BA.exp() * log_prob_BA).sum(1).mean()
         sought = policy - self.config.entropy * entropy if self.config.entropy else policy
@@ -243,6 +269,7 @@ class PpoLearner:
         clip_norm(gradients, self.config.max_grad_norm)
         self._adam.step(gradients, rate)
         self._terms.append(torch.stack([policy.detach(), entropy.detach(), -moved_B.mean()]))
+        return True
 
     def means(self) -> dict[str, float]:
         """Return the mean of every term over the updates since the last call, and forget them.
@@ -284,6 +311,17 @@ class PpoLearner:
         self._critic_adam.load_state_dict(state["critic_adam"])
         self._rng.bit_generator.state = state["rng"]
         self.rollouts, self.updates = state["rollouts"], state["updates"]
+
+
+@contextmanager
+def one_thread_each() -> Generator[None]:
+    """Let torch calculate with one thread wherever it is called meanwhile: for several threads that call it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def without_clock(obs_BVF: Tensor) -> Tensor:
