@@ -2,9 +2,9 @@
 
 RAPID's network of the recipe `strong` learns from 128 worlds of a scenario by the plan `ppo`, where the adapter, the
 router and the decoder are trained and policy 1 is not, and by the plan `robust`, where everything is trained and
-attacks of so many gradient steps have begun. Each contestant is a process with one thread; rollout after rollout they
-take turns, so that a busy moment meets them all. CPU time is counted, and at the end it is told whether the weights
-are the same. Writes `ppo-speed.md` and `ppo-speed.json`.
+attacks of so many gradient steps have begun. Each contestant is a process; rollout after rollout they
+take turns, so that a busy moment meets them all. CPU time is counted, and the clock's, which says nothing on a busy
+machine; at the end it is told whether the weights are the same. Writes `ppo-speed.md` and `ppo-speed.json`.
 
     python benchmarks/ppo_speed.py --before v0.9 --rounds 7
 """
@@ -36,7 +36,10 @@ GATE = 0.3
 
 
 class Clock:
-    """Counts the CPU seconds of each part; a part within another is taken off it."""
+    """Counts the CPU seconds of each part; a part within another is taken off it.
+
+    With several threads the parts of an update overlap, and each is counted with what goes on beside it.
+    """
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = dict.fromkeys(PARTS, 0.0)
@@ -63,7 +66,7 @@ class Clock:
         return run
 
 
-def compete(plan: str, attack_steps: int, scenario: str) -> None:
+def compete(plan: str, attack_steps: int, scenario: str, threads: int, attention: str) -> None:
     """Take a rollout for every line of the standard input; tell the seconds of each part, and what the weights are."""
     from rapid.networks import q_network
     from rapid.presets import preset
@@ -73,11 +76,11 @@ def compete(plan: str, attack_steps: int, scenario: str) -> None:
     from rapid.training.machinery import adam, adversary, worlds
     from rapid.training.machinery.record import network_fingerprint
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     torch.set_flush_denormal(True)
     config, seen = preset("strong", "full", plan), get_scenario(scenario)
     adapt = config.adapt
-    settings = replace(adapt.ppo, critic_steps=0)
+    settings = replace(adapt.ppo, critic_steps=0, **({"attention": attention} if attention else {}))
     liar = replace(adapt.adversary, steps=attack_steps) if attack_steps else adapt.adversary
     network = q_network.build_network(config.network, seen.lanes, 0)
     if adapt.memory:
@@ -99,19 +102,21 @@ def compete(plan: str, attack_steps: int, scenario: str) -> None:
     collect, update = clock.timed("driving", collector.collect), clock.timed("forward", learner.update)
     for _ in sys.stdin:
         clock.spent = dict.fromkeys(PARTS, 0.0)
+        start, start_cpu = time.perf_counter(), time.process_time()
         # Earlier programs have no choice of how attention is computed.
         with learner.computing() if hasattr(learner, "computing") else nullcontext():
             update(collect(learner, 1.0))
+        whole = {"cpu": time.process_time() - start_cpu, "clock": time.perf_counter() - start}
         steps = settings.num_envs * settings.rollout
-        weights = network_fingerprint(network)
-        print(json.dumps({"steps": steps, "seconds": clock.spent, "weights": weights}), flush=True)
+        told = {"steps": steps, "seconds": clock.spent | whole, "weights": network_fingerprint(network)}
+        print(json.dumps(told), flush=True)
 
 
 class Contestant:
     """A process that learns, of one tree of files."""
 
-    def __init__(self, tree: Path, plan: str, attack_steps: int, scenario: str) -> None:
-        words = ["--compete", plan, "--attack-steps", str(attack_steps), "--scenario", scenario]
+    def __init__(self, tree: Path, plan: str, attack_steps: int, given: list[str]) -> None:
+        words = ["--compete", plan, "--attack-steps", str(attack_steps), *given]
         self._process = subprocess.Popen(
             [sys.executable, __file__, *words],
             stdin=subprocess.PIPE,
@@ -135,12 +140,14 @@ class Contestant:
         self._process.communicate()
 
 
-def race(trees: dict[str, Path], plans: dict[str, tuple[str, int]], scenario: str, rounds: int) -> list[dict[str, Any]]:
-    """Return what every contestant took in each round."""
+def race(
+    contestants: dict[str, tuple[Path, list[str]]], plans: dict[str, tuple[str, int]], rounds: int
+) -> list[dict[str, Any]]:
+    """Return what every contestant, a tree of files and further words, took in each round."""
     results: list[dict[str, Any]] = []
     for title, (plan, attack_steps) in plans.items():
-        there = {name: Contestant(tree, plan, attack_steps, scenario) for name, tree in trees.items()}
-        turns: dict[str, list[dict[str, Any]]] = {name: [] for name in trees}
+        there = {name: Contestant(tree, plan, attack_steps, words) for name, (tree, words) in contestants.items()}
+        turns: dict[str, list[dict[str, Any]]] = {name: [] for name in contestants}
         for _ in range(rounds + 1):
             for name, contestant in there.items():
                 turns[name].append(contestant.turn())
@@ -148,7 +155,7 @@ def race(trees: dict[str, Path], plans: dict[str, tuple[str, int]], scenario: st
             contestant.end()
             # The first round warms up.
             took = turns[name][1:]
-            seconds = {part: [each["seconds"][part] for each in took] for part in PARTS}
+            seconds = {part: [each["seconds"][part] for each in took] for part in (*PARTS, "cpu", "clock")}
             weights = took[-1]["weights"]
             results.append(
                 {"kind": title, "who": name, "steps": took[0]["steps"], "seconds": seconds, "weights": weights}
@@ -161,24 +168,22 @@ def report(results: list[dict[str, Any]], commits: dict[str, str], scenario: str
     lines = [
         "# What a step of PPO costs",
         "",
-        f"Steps of {scenario} in a second of CPU time on one thread, median (least to most) of {rounds} rollouts of "
-        f"{results[0]['steps']:,} steps, all contestants in turns. The shares are of the median rollout's time: "
+        f"Steps of {scenario} in a second of CPU time, and by the clock, median (least to most) of {rounds} rollouts "
+        f"of {results[0]['steps']:,} steps, all contestants in turns. The shares are of the median rollout's CPU time: "
         "stepping the worlds; choosing actions and valuing what was met; attacking what is seen; and of the updates "
         "the losses, their gradients, and the steps along them.",
         "",
-        f"| training | program | steps/s | {' | '.join(PARTS)} | weights |",
-        f"|---|---|---|{'---|' * len(PARTS)}---|",
+        f"| training | program | steps per CPU second | by the clock | {' | '.join(PARTS)} | weights |",
+        f"|---|---|---|---|{'---|' * len(PARTS)}---|",
     ]
     for result in results:
-        total = np.sum([result["seconds"][part] for part in PARTS], 0)
-        rates = result["steps"] / total
-        shares = [np.median(result["seconds"][part]) / np.median(total) for part in PARTS]
+        rates, clocked = (result["steps"] / np.array(result["seconds"][kind]) for kind in ("cpu", "clock"))
+        shares = [np.median(result["seconds"][part]) / np.median(result["seconds"]["cpu"]) for part in PARTS]
         first = next(other for other in results if other["kind"] == result["kind"])
         same = "" if first is result else "the same" if first["weights"] == result["weights"] else "others"
-        lines.append(
-            f"| {result['kind']} | {result['who']} | **{np.median(rates):,.0f}** ({min(rates):,.0f} to "
-            f"{max(rates):,.0f}) | {' | '.join(f'{share:.0%}' for share in shares)} | {same} |"
-        )
+        rate = f"**{np.median(rates):,.0f}** ({min(rates):,.0f} to {max(rates):,.0f}) | {np.median(clocked):,.0f}"
+        parts = " | ".join(f"{share:.0%}" for share in shares)
+        lines.append(f"| {result['kind']} | {result['who']} | {rate} | {parts} | {same} |")
     made = ", ".join(f"{name}: commit {sha}" for name, sha in commits.items())
     versions = f"torch {version('torch')}, numba {version('numba')}, Python {platform.python_version()}"
     lines += [
@@ -209,11 +214,13 @@ def main() -> None:
     parser.add_argument("--before", default="", help="a commit, or a folder with one, beside which it is measured")
     parser.add_argument("--attack-steps", type=int, default=10, help="gradient steps of the attack")
     parser.add_argument("--scenario", default="lane-3-density-2", help="where it drives")
+    parser.add_argument("--threads", type=int, default=1, help="threads of a contestant")
+    parser.add_argument("--attention", default="", help="adapt.ppo.attention of these files in place of the plans'")
     parser.add_argument("--out", type=Path, default=ROOT / "results", help="where the tables go")
     parser.add_argument("--compete", default="", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.compete:
-        compete(chosen.compete, chosen.attack_steps, chosen.scenario)
+        compete(chosen.compete, chosen.attack_steps, chosen.scenario, chosen.threads, chosen.attention)
         return
     plans = {"clean": ("ppo", 0), f"{chosen.attack_steps} attack steps": ("robust", chosen.attack_steps)}
     command = " ".join(["python", "benchmarks/ppo_speed.py", *sys.argv[1:]])
@@ -226,7 +233,10 @@ def main() -> None:
             git(ROOT, "worktree", "add", "--detach", str(trees["before"]), chosen.before)
         try:
             commits = {name: git(tree, "rev-parse", "--short", "HEAD") for name, tree in trees.items()}
-            results = race(trees, plans, chosen.scenario, chosen.rounds)
+            given = ["--scenario", chosen.scenario, "--threads", str(chosen.threads)]
+            own = given + (["--attention", chosen.attention] if chosen.attention else [])
+            contestants = {name: (tree, own if name == "now" else given) for name, tree in trees.items()}
+            results = race(contestants, plans, chosen.rounds)
         finally:
             if made:
                 git(ROOT, "worktree", "remove", "--force", str(trees["before"]))
