@@ -1,6 +1,7 @@
 """The decision loop against scripted answers: tools, repair, fallback, accounts."""
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from rapid.teacher.chat import ChatError, Conversation, Reply, Request, ToolCall
 from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.decision import Decision, UnreachableError, to_record
 from rapid.teacher.facts import gather, safest
-from rapid.teacher.prompt import WORDS
+from rapid.teacher.prompt import WORDS, outcome
 from rapid.teacher.replay import Replay
 from rapid.teacher.scene import read_scenes
 
@@ -214,6 +215,29 @@ def test_a_copied_example_is_no_reason(world):
     script = Script(Reply("hm"), copied)
     assert decide(script, world, "react").status == "repaired"
     assert "{" not in script.heard[1][-1]["content"]
+
+
+@pytest.mark.parametrize("style", ["digest", "react"])
+@pytest.mark.parametrize("native", [True, False])
+def test_what_a_prompt_says_is_no_decision_when_it_is_repeated(world, style, native):
+    """A small model repeats what it reads: no example, sentence or list of ours may count as its decision."""
+    script = Script(Reply("hm"), native_tools=native)
+    told = [message["content"] for message in (decide(script, world, style), script.heard[-1])[1]]
+    copies = {*told}
+    for text in told:
+        copies |= {line for line in text.splitlines() if line.strip()}
+        copies |= {*re.split(r"(?<=\.)\s+", text), *re.findall(r"\{[^{}]*\}", text)}
+    copies -= {"hm"}
+    assert len(copies) > 15
+    facts = gather(read_scenes(world(cars=((30, 1, 20),)), 3)[0])
+    choices = [f"{WORDS[action]}: {outcome(facts, action)}" for action in facts.available]
+    for copy in sorted(copies):
+        decision = decide(Script(Reply(copy), native_tools=native), world, style, max_turns=1)
+        if copy in choices:
+            # One of the possibilities, picked: a decision, but the words are ours.
+            assert not decision.explanation, copy
+        else:
+            assert decision.status == "fallback", copy
 
 
 def test_an_answer_that_was_cut_off_says_what_to_raise(world):

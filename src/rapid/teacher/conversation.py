@@ -251,7 +251,8 @@ class ConversingTeacher:
             probabilities = action_probabilities(talk.tokens, action, facts.available)
         return Decision(
             action,
-            explanation=choice.explanation,
+            # Our own words, repeated, are no reason of the model's.
+            explanation="" if choice.explanation == outcome(facts, action) else choice.explanation,
             answer=talk.answer[: 4 * EXPLANATION_LIMIT],
             probabilities=probabilities,
             told=prompt.user,
