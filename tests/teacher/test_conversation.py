@@ -1,9 +1,11 @@
 """The decision loop against scripted answers: tools, repair, fallback, accounts."""
+# pyright: basic
 
 import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +38,7 @@ class Script:
         return line
 
 
-def teacher(script, style="digest", **settings):
+def teacher(script, style: Any = "digest", **settings):
     config = TeacherConfig(backend="endpoint", model="m", style=style, concurrency=1, **settings)
     return ConversingTeacher(script, config, {"model": "m"}, 3)
 

@@ -139,7 +139,7 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
         table = read_parquet(root / TRANSITIONS_FILE, "transitions")
         log = current_log(read_parquet(root / LOG_FILE, "teacher log")) if LOG_FILE in meta["files"] else None
         memory = read_experiences(root / MEMORY_FILE) if MEMORY_FILE in meta["files"] else None
-        _check_kinds(meta)
+        check_kinds(meta)
         dataset = Dataset(
             meta["scenario"], from_table(table), meta["drivers"], log, meta["mixture"], meta["collection"], memory
         )
@@ -159,7 +159,7 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
     return dataset
 
 
-def _check_kinds(meta: dict[str, Any]) -> None:
+def check_kinds(meta: dict[str, Any]) -> None:
     """Raise TypeError or ValueError unless what ``dataset.json`` says has the form that its readers expect."""
     for name in ("mixture", "collection"):
         if meta[name] is not None and not isinstance(meta[name], dict):

@@ -10,6 +10,8 @@ import json
 import os
 import warnings
 import zipfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +20,11 @@ import gymnasium
 import numpy as np
 
 from rapid.data.card import card
-from rapid.data.dataset import LICENCE, SCHEMA_VERSION, Dataset
+from rapid.data.dataset import LICENCE, SCHEMA_VERSION, Dataset, check_kinds
 from rapid.data.transitions import Transitions, concatenate
-from rapid.errors import RapidError, how_to_install
+from rapid.errors import RapidError, how_to_install, sentence
 from rapid.files import atomic_path
+from rapid.scenarios import get_scenario
 
 _KEPT = ("source_N", "episode_N", "step_N", "spawn_seed_N", "probabilities_NA")
 """What the other formats have no name for and carry as extra columns."""
@@ -41,13 +44,12 @@ def import_npz(path: str | os.PathLike[str]) -> Dataset:
     Raises:
         RapidError: the file is missing, damaged or something else.
     """
-    try:
+    with _foreign(f"'{path}' is no dataset in NumPy's format"):
+        with zipfile.ZipFile(path) as packed:
+            _check_size(sum(member.file_size for member in packed.infolist()), Path(path))
         with np.load(path, allow_pickle=False) as content:
             arrays: dict[str, Any] = {field.name: content[field.name] for field in fields(Transitions)}
-            meta = str(content["meta"])
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise RapidError(f"'{path}' is no dataset in NumPy's format: {error}. Export it again.") from error
-    return _dataset(Transitions(**arrays), meta, str(path))
+            return _dataset(Transitions(**arrays), str(content["meta"]), str(path))
 
 
 def export_minari(dataset: Dataset, name: str) -> Any:
@@ -104,19 +106,26 @@ def import_minari(name: str) -> Dataset:
     """Read what `export_minari` made.
 
     Raises:
-        RapidError: Minari is not installed, has no such dataset, or it was not made by RAPID.
+        RapidError: Minari is not installed, has no such dataset, or it is damaged or was not made by RAPID.
     """
     minari = _need("minari")
     try:
         source = minari.load_dataset(name)
-    except (FileNotFoundError, ValueError) as error:
-        raise RapidError(f"Minari has no dataset '{name}': {error}. Choose one of `minari list local`.") from error
-    meta = source.storage.metadata.get("rapid")
-    if meta is None:
-        raise RapidError(f"The Minari dataset '{name}' was not made by RAPID: it lacks the provenance of its steps.")
-    runs: list[Transitions] = []
-    for episode in source.iterate_episodes():
-        runs.append(
+    except Exception as error:  # whatever is in its files
+        raise RapidError(
+            f"Minari has no dataset '{name}' that it can read: {sentence(str(error))} Choose one of `minari list "
+            "local`."
+        ) from error
+    with _foreign(f"The Minari dataset '{name}' cannot be read"):
+        meta = source.storage.metadata.get("rapid")
+        if meta is None:
+            raise RapidError(
+                f"The Minari dataset '{name}' was not made by RAPID: it lacks the provenance of its steps."
+            )
+        for path in Path(source.storage.data_path).glob("*.hdf5"):
+            with _need("h5py").File(path, "r") as file:
+                _check_size(_bytes_in(file), path)
+        runs = [
             _run(
                 np.asarray(episode.observations, np.float32),
                 np.asarray(episode.actions),
@@ -125,8 +134,9 @@ def import_minari(name: str) -> Dataset:
                 np.asarray(episode.truncations),
                 {field: np.asarray(episode.infos[field])[:-1] for field in _KEPT},
             )
-        )
-    return _dataset(_together(runs), meta, name)
+            for episode in source.iterate_episodes()
+        ]
+        return _dataset(_together(runs), meta, name)
 
 
 def export_d3rlpy(dataset: Dataset, path: str | os.PathLike[str], flatten: bool = True) -> None:
@@ -179,8 +189,9 @@ def import_d3rlpy(path: str | os.PathLike[str]) -> Dataset:
     """
     h5py = _need("h5py")
     runs: list[Transitions] = []
-    try:
+    with _foreign(f"'{path}' is no d3rlpy dataset that RAPID exported"):
         with h5py.File(path, "r") as file:
+            _check_size(_bytes_in(file), Path(path))
             meta = str(file.attrs["rapid"])
             for number in range(int(file["num_episodes"][()])):
                 kept = {field: file[f"{field}_{number}"][()] for field in _KEPT}
@@ -199,9 +210,39 @@ def import_d3rlpy(path: str | os.PathLike[str]) -> Dataset:
                         kept,
                     )
                 )
-    except (OSError, KeyError, ValueError) as error:
-        raise RapidError(f"'{path}' is no d3rlpy dataset that RAPID exported: {error}. Export it again.") from error
-    return _dataset(_together(runs), meta, str(path))
+        return _dataset(_together(runs), meta, str(path))
+
+
+_EXPANSION = 1000
+"""How many bytes may come of one in a file: compression gives no more, and a header may claim anything."""
+
+
+@contextmanager
+def _foreign(fault: str) -> Generator[None, None, None]:
+    """Explain in one paragraph whatever the libraries that read a file of others find wrong with it."""
+    try:
+        yield
+    except RapidError:
+        raise
+    except Exception as error:  # what they raise is written nowhere: TypeError, OverflowError, MemoryError, ...
+        said = f"{type(error).__name__}: {error}"
+        raise RapidError(f"{fault}: {sentence(said)} It is damaged, or of another kind; export it again.") from error
+
+
+def _bytes_in(file: Any) -> int:
+    """Return how much memory the arrays in an HDF5 file would take; their shapes are in headers."""
+    sizes: list[int] = []
+    file.visititems(lambda _, item: sizes.append(int(getattr(item, "nbytes", 0))))
+    return sum(sizes)
+
+
+def _check_size(claimed: int, path: Path) -> None:
+    """Raise before anything is allocated for what a file claims to hold but cannot."""
+    if claimed > _EXPANSION * path.stat().st_size:
+        raise RapidError(
+            f"'{path}' claims to hold {claimed} bytes, but is only {path.stat().st_size} long. It is damaged, or not "
+            "meant well."
+        )
 
 
 def _runs(transitions: Transitions) -> list[Transitions]:
@@ -214,6 +255,10 @@ def _runs(transitions: Transitions) -> list[Transitions]:
 
 def _run(obs: Any, action: Any, reward: Any, terminated: Any, truncated: Any, kept: dict[str, Any]) -> Transitions:
     """Return the transitions of one run from its T + 1 observations."""
+    for name, whole in (("action", action), *kept.items()):
+        # 2.7 is no action, and must not become 2.
+        if name != "probabilities_NA" and np.asarray(whole).dtype.kind not in "iu":
+            raise TypeError(f"{name.partition('_N')[0]} is of type {np.asarray(whole).dtype}")
     return Transitions(
         obs_NVF=np.asarray(obs[:-1], np.float32),
         action_N=np.asarray(action, np.int64),
@@ -246,6 +291,8 @@ def _meta(dataset: Dataset) -> str:
 def _dataset(transitions: Transitions, meta: str, where: str) -> Dataset:
     """Return the dataset if it is valid and of this version."""
     facts = json.loads(meta)
+    check_kinds(facts)
+    get_scenario(facts["scenario"])
     if facts.get("schema_version") != SCHEMA_VERSION:
         raise RapidError(
             f"'{where}' has schema version {facts.get('schema_version')}; this version of RAPID reads "
