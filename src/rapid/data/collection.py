@@ -21,6 +21,7 @@ from rapid.data.driving import JOURNAL_FILE, Budget, Collecting, MakeWorlds, Spe
 from rapid.data.journal import check_settings, check_unclaimed
 from rapid.data.parts import LIST_FILE
 from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
+from rapid.data.unwritten import UNWRITTEN_FILE
 from rapid.errors import RapidError
 from rapid.files import make_directory, read_json, remove_leftovers, write_json, write_text
 from rapid.locks import LOCK_FILE, exclusive
@@ -155,7 +156,7 @@ def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
 
 def _clear(work: Path) -> None:
     """Remove what a collection keeps while it is under way."""
-    for pattern in ("part-*", "journal*.jsonl", LIST_FILE, MEMORY_FILE, "settings.json"):
+    for pattern in ("part-*", "journal*.jsonl", LIST_FILE, MEMORY_FILE, UNWRITTEN_FILE, "settings.json"):
         for path in work.glob(pattern):
             path.unlink()
 
@@ -180,6 +181,8 @@ def _reopen(dataset: Dataset, work: Path) -> None:
     for field in PART_SCHEMA:
         if field.name not in table.column_names:
             table = table.append_column(field, dataset.log.column(field.name))
+    if lost := (dataset.collection or {}).get("lost"):
+        write_json(work / UNWRITTEN_FILE, {"lost": lost, "asked": {}}, sealed=True)
     if dataset.memory is not None:
         # First: an episode in a part that is not in the memory would be looked back on again.
         write_text(work / MEMORY_FILE, to_lines(dataset.memory[dataset.known :]))

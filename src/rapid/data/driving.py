@@ -1,9 +1,10 @@
 """Driving groups of episodes side by side: every decision goes to the journal before it acts."""
 
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from rapid.data.journal import Journal
 from rapid.data.parts import Parts
 from rapid.data.tables import LOG_SCHEMA, PART_SCHEMA, TRANSITION_SCHEMA, from_table, to_table
 from rapid.data.transitions import SOURCES, TEACHER, Transitions
+from rapid.data.unwritten import UNWRITTEN_FILE, Cost, Unwritten
 from rapid.errors import RapidError
 from rapid.progress import Task
 from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
@@ -32,6 +34,7 @@ from rapid.teacher.decision import (
 )
 from rapid.teacher.experience import MEMORY_FILE, Experience
 from rapid.teacher.patience import StoppedError
+from rapid.termination import StoppedError as TerminatedError
 
 MakeWorlds = Callable[[int], Any]
 """Gives a vector environment of so many worlds, in which a finished world waits for the others."""
@@ -105,6 +108,11 @@ class Collecting:
         self.hindsight, self.looked_back = Hindsight(work / MEMORY_FILE, teacher), 0
         for experience in self.hindsight.experiences:
             self._charge(experience)
+        # Of a teacher that waits for others.
+        self.unwritten = Unwritten(work / UNWRITTEN_FILE) if isinstance(teacher, Timed) else None
+        if self.unwritten:
+            self.tokens += self.unwritten.lost.tokens
+            self.cost += self.unwritten.lost.cost
         self.start = time.monotonic()
         if budget.seconds and isinstance(teacher, Timed):
             teacher.end_by(self.start + budget.seconds, f"The budget of {budget.seconds:g} seconds was spent")
@@ -229,9 +237,14 @@ class Collecting:
         decisions = journal.kept(len(seen))
         wanted = [place for place, decision in enumerate(decisions) if decision is None]
         made: Sequence[Decision | None] = []
+        let_go = 0
+        if self.unwritten:
+            share = len(wanted) / max(self.decisions, 1)
+            self.unwritten.ask(Cost(len(wanted), round(self.tokens * share), self.cost * share))
         try:
             made = self.teacher.decide(seen[wanted], [previous[place] for place in wanted], keys[wanted])
         except (UnfinishedError, InterruptedDecisions) as broken_off:
+            let_go = broken_off.let_go
             made = [None if decision and decision.unanswered else decision for decision in broken_off.decisions]
             raise
         except UnreachableError:
@@ -245,6 +258,9 @@ class Collecting:
             if fresh:
                 journal.append(seen, decisions)
                 self.fresh += fresh
+            # Told to end by a signal, it waits for nothing: that is as a kill.
+            if self.unwritten and not isinstance(sys.exception(), TerminatedError):
+                self.unwritten.settle(let_go)
         return [decision for decision in decisions if decision is not None]
 
     def _look_back(self) -> None:
@@ -288,12 +304,13 @@ class Collecting:
     def dataset(self, complete: bool) -> Dataset:
         """Return everything collected so far as a dataset."""
         table = pa.concat_tables([PART_SCHEMA.empty_table(), *self.parts.leading])
+        lost = {"lost": asdict(self.unwritten.lost)} if self.unwritten and self.unwritten.lost.decisions else {}
         return Dataset(
             scenario=self.settings["scenario"],
             transitions=from_table(table),
             drivers={self.settings["source"]: self.settings["driver"]},
             log=table.select(LOG_SCHEMA.names).combine_chunks(),
-            collection={"complete": complete, "settings": self.settings},
+            collection={"complete": complete, "settings": self.settings, **lost},
             memory=self.hindsight.memory,
         )
 

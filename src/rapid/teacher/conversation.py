@@ -179,13 +179,15 @@ class ConversingTeacher:
     def _all_of(self, conversations: Sequence[Conversation[Decision]]) -> list[Decision]:
         """Return what came of all conversations; whoever breaks them off is handed what came until then."""
         made: list[Decision | None] = []
+        before = self._patience.let_go
         try:
             made.extend(self._lead(conversations))
         except KeyboardInterrupt:
-            raise InterruptedDecisions([*made, *[None] * (len(conversations) - len(made))]) from None
+            all_of = [*made, *[None] * (len(conversations) - len(made))]
+            raise InterruptedDecisions(all_of, self._patience.let_go - before) from None
         decisions = [decision for decision in made if decision is not None]
         if len(decisions) < len(made):
-            raise UnfinishedError(self._patience.reason, made)
+            raise UnfinishedError(self._patience.reason, made, self._patience.let_go - before)
         return decisions
 
     def _lead(self, conversations: Sequence[Conversation[T]]) -> Iterator[T | None]:

@@ -26,19 +26,25 @@ class UnreachableError(RapidError):
 
 
 class UnfinishedError(StoppedError):
-    """The time was over before all worlds were decided for; `decisions` holds those that were, and None."""
+    """The time was over before all worlds were decided for; `decisions` holds those that were, and None.
 
-    def __init__(self, message: str, decisions: Sequence["Decision | None"]) -> None:
+    So many requests under way were `let_go`.
+    """
+
+    def __init__(self, message: str, decisions: Sequence["Decision | None"], let_go: int = 0) -> None:
         super().__init__(message)
-        self.decisions = decisions
+        self.decisions, self.let_go = decisions, let_go
 
 
 class InterruptedDecisions(KeyboardInterrupt):
-    """The user interrupted; `decisions` holds those that were made all the same, and None for the others."""
+    """The user interrupted; `decisions` holds those that were made all the same, and None for the others.
 
-    def __init__(self, decisions: Sequence["Decision | None"]) -> None:
+    So many requests under way were `let_go`.
+    """
+
+    def __init__(self, decisions: Sequence["Decision | None"], let_go: int = 0) -> None:
         super().__init__()
-        self.decisions = decisions
+        self.decisions, self.let_go = decisions, let_go
 
 
 @dataclass(frozen=True)

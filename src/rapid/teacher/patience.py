@@ -56,6 +56,8 @@ class Patience:
         self._heard = time.monotonic()
         self._slowest = self._silence = 0.0
         self._words = 0
+        self.let_go = 0
+        """Requests that were under way when nothing was waited for any longer."""
 
     @property
     def begin_until(self) -> float:
@@ -109,6 +111,10 @@ class Patience:
             yield flight
             with self._lock:
                 self._slowest = max(self._slowest, time.monotonic() - flight.start)
+        except StoppedError:
+            with self._lock:
+                self.let_go += 1
+            raise
         finally:
             with self._lock:
                 self._flights.remove(flight)

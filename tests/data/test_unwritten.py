@@ -1,0 +1,155 @@
+"""What an end in the middle costs in paid answers is counted: by a kill, by a second Ctrl-C, by the end of the time."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fake_server import Server, answer, completion
+from rapid.config import TeacherConfig
+from rapid.data.card import card
+from rapid.data.collection import collect
+from rapid.data.dataset import Dataset, load_dataset
+from rapid.data.driving import Budget, SpentError
+from rapid.data.unwritten import Cost, lost_in
+from rapid.teacher.conversation import ConversingTeacher
+from rapid.teacher.decision import Decision
+from rapid.teacher.endpoint import Endpoint
+from rapid.termination import StoppedError
+
+SCENARIO = "lane-3-density-2-fast"
+SCRIPT = """
+import sys
+from rapid.config import TeacherConfig
+from rapid.data.collection import collect
+from rapid.teacher.conversation import ConversingTeacher
+from rapid.teacher.endpoint import Endpoint
+config = TeacherConfig(backend="endpoint", model="m", base_url=sys.argv[1], api_key_env="NONE")
+teacher = ConversingTeacher(Endpoint(config), config, {"model": "m"}, 3)
+collect(teacher, "lane-3-density-2-fast", sys.argv[2], 120, 4)
+"""
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    server = Server()
+    yield server
+    server.close()
+
+
+class Stuck:
+    """Answers so many requests at once, and none after them until it is let go."""
+
+    def __init__(self, quick: int) -> None:
+        self.left, self.begun, self.open = quick, threading.Semaphore(0), threading.Event()
+
+    def __call__(self, handler: Any, request: Any) -> None:
+        self.left -= 1
+        if self.left < 0:
+            self.begun.release()
+            self.open.wait(30)
+        try:
+            answer(completion("keep"))(handler, request)
+        except OSError:  # nobody waits any more
+            return
+
+
+def driver(server: Server, **settings: Any) -> ConversingTeacher:
+    config = TeacherConfig(backend="endpoint", model="m", base_url=server.url, api_key_env="NONE", **settings)
+    return ConversingTeacher(Endpoint(config), config, {"model": "m"}, 3)
+
+
+def go_on(server: Server, place: Path, **options: Any) -> Dataset:
+    server.acts = [answer(completion("keep"))]
+    return collect(driver(server), SCENARIO, place, 120, 4, **options)
+
+
+def test_what_a_kill_costs_in_paid_answers_is_counted(
+    server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    stuck = Stuck(8)  # two steps of four worlds; in the third there are three
+    server.acts = [stuck]
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT, server.url, str(tmp_path / "killed")])
+    for _ in range(3):
+        assert stuck.begun.acquire(timeout=120)
+    process.kill()
+    process.wait()
+    stuck.open.set()
+    before = len(server.requests)
+    assert before == 11
+    data = go_on(server, tmp_path / "killed")
+    # What a decision costs, as that server tells.
+    each = json.loads(json.dumps(completion("keep")))["usage"]
+    tokens = 3 * (each["prompt_tokens"] + each["completion_tokens"])
+    said = capsys.readouterr().err
+    assert f"at most 3 decisions, about {tokens} tokens were paid for and lost" in said
+    assert len(server.requests) - before == len(data) - 8
+    assert lost_in(data.collection) == Cost(3, tokens, 0.0)
+    assert f"lost when processes ended: at most 3 decisions, about {tokens} tokens" in card(data)
+    # It stays known when the collection is extended, and a whole one tells of nothing.
+    more = collect(driver(server), SCENARIO, tmp_path / "killed", 150, 4)
+    assert len(more) > len(data)
+    assert lost_in(load_dataset(tmp_path / "killed").collection).decisions == 3
+    whole = go_on(server, tmp_path / "whole")
+    assert whole.collection is not None
+    assert "lost" not in whole.collection
+    assert "lost when" not in card(whole)
+    assert whole.transitions.action_N.tolist() == data.transitions.action_N.tolist()
+
+
+def test_to_be_told_to_end_costs_as_much(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    server.acts = [answer(completion("keep"))]
+    teacher, calls = driver(server), iter(["yes", "yes", "no"])
+    decide = teacher.decide
+
+    def until_told(*given: Any) -> list[Decision]:
+        if next(calls) == "no":
+            raise StoppedError("what is done is kept")
+        return decide(*given)
+
+    monkeypatch.setattr(teacher, "decide", until_told)
+    with pytest.raises(StoppedError):
+        collect(teacher, SCENARIO, tmp_path, 120, 4)
+    assert lost_in(go_on(server, tmp_path).collection).decisions == 3
+
+
+def test_what_the_second_interruption_lets_go_is_counted(server: Server, tmp_path: Path):
+    stuck = Stuck(8)
+    server.acts = [stuck]
+
+    def press() -> None:
+        for _ in range(3):
+            stuck.begun.acquire(timeout=60)
+        for _ in range(2):
+            time.sleep(0.3)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    presses = threading.Thread(target=press)
+    presses.start()
+    with pytest.raises(KeyboardInterrupt):
+        collect(driver(server), SCENARIO, tmp_path, 120, 4)
+    presses.join()
+    stuck.open.set()
+    assert lost_in(go_on(server, tmp_path).collection).decisions == 3
+
+
+def test_what_the_end_of_the_time_lets_go_is_counted_and_spent(server: Server, tmp_path: Path):
+    stuck = Stuck(8)
+    server.acts = [stuck]
+    with pytest.raises(SpentError, match="seconds was spent"):
+        collect(driver(server), SCENARIO, tmp_path, 120, 4, budget=Budget(seconds=3.0))
+    stuck.open.set()
+    paid = 8 * 18
+    # What was lost counts against the budget: eight were answered, three are guessed.
+    with pytest.raises(SpentError, match="tokens was spent"):
+        go_on(server, tmp_path, budget=Budget(tokens=paid + 30))
+    lost = lost_in(go_on(server, tmp_path).collection)
+    assert (lost.decisions, lost.tokens > 0) == (3, True)
