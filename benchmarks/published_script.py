@@ -21,6 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import highway_env  # noqa: F401 - a script's subprocesses begin with this file in the script's place
 import numpy as np
 
 

@@ -7,6 +7,7 @@ A block begins with ``<!-- table: NAME -->`` and ends with ``<!-- end -->``.
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,31 +38,73 @@ def _number(rows: Sequence[EpisodeRow]) -> str:
     return f"{float(np.mean(column(rows, 'episode_return'))):.1f} ({crash})"
 
 
+ALGORITHMS = {
+    "distil": ("distilled", "distilled-without-robust", "bc", "offline-dqn"),
+    "adapt": ("rapid-10k", "rapid", "rapid-ppo", "rapid-robust"),
+    "baselines": ("offline-dqn", "offline-ddqn", "cql", "bc", "online-dqn", "online-ddqn", "online-ppo", "mlp-ppo"),
+}
+"""Rows of the table on each algorithm's page."""
+PRINTED = {
+    "distilled": "rapid",
+    "distilled-without-robust": "rapid_without_robust",
+    "offline-ddqn": "ddqn",
+    "cql": "cql",
+}
+"""Columns of the paper's offline table, which has no attacks; it is of the mixed data."""
+PLACES = [(scenario, attack) for scenario in PAPER_SCENARIOS for attack in ("none", "pgd")]
+
+
 def works(store: Store) -> str:
     """Return README's table: what each driver earns, clean and under PGD, in the paper's three scenarios."""
-    lanes = [f"lane-{get_scenario(name).lanes}" for name in PAPER_SCENARIOS]
-    heads = [f"{lane}, {what}" for lane in lanes for what in ("clean", "PGD")]
-    paper = [
-        f"{said.mean:.1f}" if (said := paper_result("attack", attack, scenario=name, method="RAPID")) else "–"
-        for name in PAPER_SCENARIOS
-        for attack in ("none", "pgd")
-    ]
-    lines = [["", *heads], ["*the paper's RAPID*", *paper]]
+    lines = [["*the paper's RAPID*", *_paper("RAPID")]]
     for name in WORKS:
-        method = METHODS[name]
-        cells: list[str] = []
-        for scenario in PAPER_SCENARIOS:
-            for attack in ("none", "pgd"):
-                seen = method.under(attack)
-                if not seen:
-                    cells.append("–")
-                    continue
-                drives = method_drives(Request("strong", "full"), method, scenario, (seen,))
-                rows, _ = rows_of(store, drives, Legacy("strong", name, scenario, seen))
-                cells.append(_number(rows))
-        label = f"**{method.label}**" if name == WORKS[-1] else method.label
-        lines.append([label, *cells])
-    first, *rest = ("| " + " | ".join(line) + " |" for line in lines)
+        label = METHODS[name].label
+        lines.append([f"**{label}**" if name == WORKS[-1] else label, *_ours(store, name)])
+    return _lines(lines)
+
+
+def algorithm(store: Store, page: str) -> str:
+    """Return the table of an algorithm's page: ours, and below it what the paper prints for the same."""
+    lines: list[list[str]] = []
+    for name in ALGORITHMS[page]:
+        method, ours = METHODS[name], _ours(store, name)
+        if set(ours) != {"–"}:
+            lines.append([method.label, *ours])
+        paper = _paper("RAPID" if name == "rapid-10k" else method.printed, PRINTED.get(name, ""))
+        if set(paper) != {"–"} and name != "rapid":
+            lines.append([f"*the paper's {method.printed or method.label.partition(',')[0]}*", *paper])
+    return _lines(lines)
+
+
+def _ours(store: Store, name: str) -> list[str]:
+    """Return a method's cells, from the rows of the recipe `strong`."""
+    method, cells = METHODS[name], list[str]()
+    for scenario, attack in PLACES:
+        seen = method.under(attack)
+        if not seen:
+            cells.append("–")
+            continue
+        drives = method_drives(Request("strong", "full"), method, scenario, (seen,))
+        rows, _ = rows_of(store, drives, Legacy("strong", name, scenario, seen))
+        cells.append(_number(rows))
+    return cells
+
+
+def _paper(method: str, offline: str = "") -> list[str]:
+    """Return the paper's cells: of its table of attacks, or the column `offline` of its offline table."""
+    cells: list[str] = []
+    for scenario, attack in PLACES:
+        if offline:
+            said = paper_result("offline", offline, scenario=scenario, dataset="mixed") if attack == "none" else None
+        else:
+            said = paper_result("attack", attack, scenario=scenario, method=method) if method else None
+        cells.append(f"{said.mean:.1f}" if said else "–")
+    return cells
+
+
+def _lines(rows: list[list[str]]) -> str:
+    heads = [f"lane-{get_scenario(name).lanes}, {'PGD' if attack == 'pgd' else 'clean'}" for name, attack in PLACES]
+    first, *rest = ("| " + " | ".join(line) + " |" for line in [["", *heads], *rows])
     return "\n".join([first, "|" + "---|" * (len(heads) + 1), *rest])
 
 
@@ -75,6 +118,7 @@ def _exhibit(name: str, recipe: str, store: Store) -> str:
 
 BLOCKS: dict[str, Callable[[Store], str]] = {
     "works": works,
+    **{f"algorithm-{page}": partial(algorithm, page=page) for page in ALGORITHMS},
     "rates": lambda store: rates_table(),
     "totals": lambda store: totals_table(),
 }
