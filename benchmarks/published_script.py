@@ -17,12 +17,14 @@ import resource
 import subprocess
 import sys
 import time
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import highway_env  # noqa: F401 - a script's subprocesses begin with this file in the script's place
 import numpy as np
+
+import_module("highway_env")  # a script's subprocesses begin with this file in the script's place
 
 
 def on_the_twin(source: str) -> str:
