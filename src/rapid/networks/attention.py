@@ -96,9 +96,9 @@ def _attend(given, read_BT, out_BTHD, share_BHLL):
                 total_L[i] = _ZERO
             for key in range(length):
                 if read_BT[sample, key]:
+                    row_L = share_LL[key]
                     for i in range(LANES):
-                        score = share_LL[key, i]
-                        most_L[i] = score if score > most_L[i] else most_L[i]
+                        most_L[i] = row_L[i] if row_L[i] > most_L[i] else most_L[i]
             for key in range(LANES):
                 row_L = share_LL[key]
                 if key >= length or not read_BT[sample, key]:
@@ -156,11 +156,13 @@ def _differentiate(given, share_BHLL, gradient_BTHD, found):
             for i in range(LANES):
                 mean_L[i] = _ZERO
             for key in range(length):
+                row_L, shown_L = score_LL[key], share_LL[key]
                 for i in range(LANES):
-                    mean_L[i] += share_LL[key, i] * score_LL[key, i]
+                    mean_L[i] += shown_L[i] * row_L[i]
             for key in range(length):
+                row_L, shown_L = score_LL[key], share_LL[key]
                 for i in range(LANES):
-                    score_LL[key, i] = share_LL[key, i] * (score_LL[key, i] - mean_L[i]) * _SCALE
+                    row_L[i] = shown_L[i] * (row_L[i] - mean_L[i]) * _SCALE
             _over_tokens(score_LL.T, key_LD, wanted[0])
             _over_tokens(score_LL, query_LD, wanted[1])
             _over_tokens(share_LL, out_LD, wanted[2])
