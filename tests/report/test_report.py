@@ -103,7 +103,7 @@ def test_page_asks_the_network_for_nothing() -> None:
     reader = Reader(content)
     for _, attributes in reader.tags:
         assert "src" not in attributes
-            assert attributes.get("href", "data:,") == "data:,"
+        assert attributes.get("href", "data:,") == "data:,"
     assert "@import" not in content
     assert "url(" not in content
     links = set(re.findall(r"https?://[^\s\"'<\\]+", content))
