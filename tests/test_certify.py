@@ -220,8 +220,14 @@ def test_a_certified_return_is_what_is_earned_without_attack_and_less_with_a_rad
     assert exact.least == pytest.approx(exact.clean)
     wide = certified_return(agent, SCENARIO, seed, 1e-3, width=8)
     assert wide.least <= exact.least
-    attacked = run_episodes(agent, SCENARIO, [seed], "pgd:steps=20,radius=0.001")
-    assert wide.least <= attacked.return_E[0] + 1e-9
+    hard = "steps=5,radius=0.001"
+    for attack in (
+        f"pgd:{hard}",
+        f"directed:target=faster,{hard}",
+        f"world:horizon=2,{hard}",
+        "lie:to=far,radius=0.001",
+    ):
+        assert wide.least <= run_episodes(agent, SCENARIO, [seed], attack).return_E[0] + 1e-9
     # Beyond the filter's box a crash in the first step is in reach, and nobody earns less.
     beyond = certified_return(agent, SCENARIO, seed, 0.1)
     assert beyond.complete
