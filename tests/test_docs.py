@@ -91,3 +91,15 @@ def test_every_command_named_in_the_pages_exists():
 
 def test_readme_is_short_enough_for_a_stranger():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
+
+
+def test_every_test_that_the_page_of_faults_names_exists():
+    named = re.findall(r"`([\w/]+\.py)::(\w+)`", (ROOT / "docs/faults.md").read_text(encoding="utf-8"))
+    assert len(named) > 60
+    missing = [
+        f"{path}::{name}"
+        for path, name in named
+        if not (ROOT / "tests" / path).is_file()
+        or not re.search(rf"^def {name}\(", (ROOT / "tests" / path).read_text(encoding="utf-8"), flags=re.M)
+    ]
+    assert missing == []
