@@ -177,13 +177,13 @@ def test_the_frozen_policys_tokens_are_computed_once_a_rollout_and_change_no_bit
 def test_policy_and_critic_learn_beside_each_other_with_the_same_result():
     found: list[tuple[bytes, bytes]] = []
     for threads in (1, 2):
-        torch.set_num_threads(1)
-        learner = PpoLearner(network(), PPO, 1.0, False, 0, 4)
-        learner.rollouts = 1
-        rollout = collect(learner, Drive(worlds, PPO.num_envs, 1), PPO)
         try:
             torch.set_num_threads(threads)
-            learner.update(rollout)
+            learner = PpoLearner(network(), PPO, 1.0, False, 0, 4)
+            learner.rollouts = 1
+            with learner.computing():
+                assert torch.get_num_threads() == 1
+                learner.update(collect(learner, Drive(worlds, PPO.num_envs, 1), PPO))
             assert torch.get_num_threads() == threads
         finally:
             torch.set_num_threads(1)

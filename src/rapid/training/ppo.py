@@ -12,7 +12,7 @@ Shapes: N transitions of a rollout, B a minibatch, V vehicles, F features, S ent
 import os
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, cast
 
@@ -174,6 +174,7 @@ class PpoLearner:
         rates = [gate_rate if parameter is network.gate else 1.0 for parameter in self._trained]
         self._adam, self._critic_adam = Adam(self._trained, rates), Adam(self._critics)
         self._rng = numpy_stream(seed, "ppo/minibatches")
+        self._beside = torch.get_num_threads() > 1 and device.type == "cpu"
         self.rollouts = self.updates = 0
         self._values: list[Tensor] = []
         self._terms: list[Tensor] = []
@@ -185,10 +186,19 @@ class PpoLearner:
             return 0.0
         return self.config.learning_rate * max(1 - self.rollouts / self.planned, 0.0)
 
-    def computing(self) -> AbstractContextManager[None]:
-        """Return what driving and learning are done within, so that attention is computed as the settings say."""
-        compiled = self.config.attention == "compiled"
-        return compiled_attention(self.network, self.critic) if compiled else nullcontext()
+    @contextmanager
+    def computing(self) -> Generator[None]:
+        """Drive and learn within this: attention as the settings say, and torch with one thread wherever it is called.
+
+        Torch's own threads wait for each other actively, which costs more than they gain with tensors of this size.
+        """
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            with compiled_attention(*((self.network, self.critic) if self.config.attention == "compiled" else ())):
+                yield
+        finally:
+            torch.set_num_threads(threads)
 
     def as_seen(self, obs_BVF: Tensor) -> Tensor:
         """Return the observations as the policy may see them."""
@@ -212,14 +222,14 @@ class PpoLearner:
     def update(self, rollout: Rollout) -> None:
         """Learn from a rollout: several passes over it in minibatches.
 
-        Neither of policy and critic reads what the other learns, so a process that may use several threads gives each
-        one of them; the result is the same, bit for bit.
+        Neither of policy and critic reads what the other learns, so in a process that may use several threads they
+        learn beside each other; the result is the same, bit for bit.
         """
         count, device = len(rollout.action_N), rollout.obs_NVF.device
         orders = [torch.from_numpy(self._rng.permutation(count)).to(device) for _ in range(self.config.epochs)]
         minibatches = [rows_B for order_N in orders for rows_B in order_N.split(self.config.batch_size)]
-        if torch.get_num_threads() > 1 and device.type == "cpu":
-            with one_thread_each(), ThreadPoolExecutor(1) as other:
+        if self._beside:
+            with ThreadPoolExecutor(1) as other:
                 critic = other.submit(flush_denormals()(self._teach_critic), rollout, minibatches)
                 self._teach_policy(rollout, minibatches)
                 critic.result()
@@ -311,17 +321,6 @@ class PpoLearner:
         self._critic_adam.load_state_dict(state["critic_adam"])
         self._rng.bit_generator.state = state["rng"]
         self.rollouts, self.updates = state["rollouts"], state["updates"]
-
-
-@contextmanager
-def one_thread_each() -> Generator[None]:
-    """Let torch calculate with one thread wherever it is called meanwhile: for several threads that call it."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def without_clock(obs_BVF: Tensor) -> Tensor:
