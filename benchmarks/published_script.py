@@ -13,7 +13,6 @@ import json
 import os
 import platform
 import re
-import resource
 import subprocess
 import sys
 import time
@@ -38,6 +37,15 @@ def changed_lines(source: str) -> list[str]:
     return [line for line in lines if line.startswith(("- ", "+ "))]
 
 
+def spent(model: Any) -> float:
+    """Return the seconds of CPU time of this process and of those in which the model's worlds are."""
+    total = time.process_time()
+    for process in getattr(model.get_env().unwrapped, "processes", ()):
+        words = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+        total += (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    return total
+
+
 def train(path: Path, steps: int, twin: bool) -> None:
     """Run the script until it has learned for so many steps, and print the seconds that took as JSON."""
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -48,12 +56,11 @@ def train(path: Path, steps: int, twin: bool) -> None:
         learn = algorithm.learn
 
         def measured(model: Any, total_timesteps: int, **more: Any) -> None:
-            wall, own = time.perf_counter(), time.process_time()
+            wall, cpu = time.perf_counter(), spent(model)
             learn(model, steps, **more)
-            found = {"wall": time.perf_counter() - wall, "cpu": time.process_time() - own, "steps": model.num_timesteps}
-            model.get_env().close()  # subprocesses are counted once they have ended
-            spent = resource.getrusage(resource.RUSAGE_CHILDREN)
-            print(json.dumps(found | {"children": spent.ru_utime + spent.ru_stime}), flush=True)
+            found = {"wall": time.perf_counter() - wall, "cpu": spent(model) - cpu, "steps": model.num_timesteps}
+            model.get_env().close()
+            print(json.dumps(found), flush=True)
             os._exit(0)
 
         algorithm.learn = measured  # type: ignore[method-assign, assignment]
@@ -86,17 +93,17 @@ def main() -> None:
         train(chosen.script, chosen.steps, chosen.train == "twin")
     print("\n".join(changed_lines(chosen.script.read_text(encoding="utf-8"))), flush=True)
     measure(chosen.script, 1, True)  # so that the kernels are compiled
-    spent: dict[bool, list[float]] = {False: [], True: []}
+    taken: dict[bool, list[float]] = {False: [], True: []}
     for _ in range(chosen.blocks):
-        for twin in spent:
+        for twin in taken:
             found = measure(chosen.script, chosen.steps, twin)
-            spent[twin].append(found["cpu"] + found["children"])
+            taken[twin].append(found["cpu"])
             name = "twin" if twin else "original"
             words = (
-                f"{found['steps']:,} steps in {spent[twin][-1]:.1f} s of CPU time, {found['wall']:.1f} s on the wall"
+                f"{found['steps']:,} steps in {taken[twin][-1]:.1f} s of CPU time, {found['wall']:.1f} s on the wall"
             )
             print(f"{name}: {words}", flush=True)
-    ratio = np.array(spent[False]) / np.array(spent[True])
+    ratio = np.array(taken[False]) / np.array(taken[True])
     names = ("highway-env", "stable_baselines3", "torch", "numba")
     print(f"original / twin: {np.median(ratio):.1f} ({ratio.min():.1f} to {ratio.max():.1f})")
     print(f"python {platform.python_version()}, " + ", ".join(f"{name} {version(name)}" for name in names))

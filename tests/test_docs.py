@@ -42,6 +42,18 @@ def run(words: list[str] | str, folder: Path, code: str | None = None) -> str:
     return done.stdout
 
 
+def explained_metrics() -> set[str]:
+    """The names in the first column of the page on metrics."""
+    return set(re.findall(r"^\| `(\w+)` ", (ROOT / "docs/metrics.md").read_text(encoding="utf-8"), flags=re.M))
+
+
+def test_every_term_that_a_trainer_writes_is_explained():
+    from rapid.training.learner import TERMS
+    from rapid.training.ppo import TERMS as OF_PPO
+
+    assert {*TERMS, *OF_PPO} <= explained_metrics()
+
+
 @pytest.mark.slow
 def test_the_tutorial_runs_as_it_is_written_and_its_metrics_are_explained(tmp_path: Path):
     for code in snippets("docs/tutorial.md", "python"):
@@ -50,7 +62,7 @@ def test_the_tutorial_runs_as_it_is_written_and_its_metrics_are_explained(tmp_pa
     assert len(commands) >= 5
     for command in commands:
         run(command, tmp_path)
-    explained = set(re.findall(r"^\| `(\w+)` ", (ROOT / "docs/metrics.md").read_text(), flags=re.M))
+    explained = explained_metrics()
     found = {
         name
         for path in tmp_path.rglob("metrics.jsonl")
