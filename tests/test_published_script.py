@@ -1,6 +1,5 @@
 """A script written for HighwayEnv trains on the twin with one line changed, and the benchmark says which."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -23,14 +22,10 @@ def test_it_trains_on_the_twin_and_tells_the_line_that_changed(tmp_path: Path) -
     pytest.importorskip("stable_baselines3")
     script = tmp_path / "script.py"
     script.write_text(SCRIPT, encoding="utf-8")
-    words = [sys.executable, str(BENCHMARK), str(script), "--steps", "16"]
-    ran = subprocess.run([*words, "--train", "twin"], capture_output=True, text=True, check=True)
-    found = json.loads(ran.stdout.splitlines()[-1])
-    assert found["steps"] == 16
-    assert 0 < found["cpu"]
-    told = subprocess.run([*words, "--blocks", "1"], capture_output=True, text=True, check=True).stdout.splitlines()
+    words = [sys.executable, str(BENCHMARK), str(script), "--steps", "16", "--blocks", "1"]
+    told = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
     assert told[:2] == [
         '- env = gymnasium.make("highway-fast-v0")',
         '+ env = gymnasium.make("rapid:rapid/highway-fast-v0")',
     ]
-    assert [line.partition(":")[0] for line in told[2:4]] == ["original", "twin"]
+    assert [line.split(" in ")[0] for line in told[2:4]] == ["original: 16 steps", "twin: 16 steps"]
