@@ -238,6 +238,7 @@ def test_what_is_shown_first(roster: Roster, saved: Path) -> None:
     [
         (["rulee"], "did you mean 'rule'"),
         (["--scenario", "lane-3"], "Unknown scenario"),
+        (["--scenario", "highway-v0"], "The same road is 'lane-4-density-1'"),
         (["--port", "70000"], "between 0 and 65535"),
         (["--moment", "x"], "no moment"),
     ],
