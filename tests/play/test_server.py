@@ -4,8 +4,10 @@ import http.client
 import json
 import socket
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -33,7 +35,7 @@ def talk(live: LivePage, origin: str | None = "", token: str | None = None, host
     return connect(address, origin=origin, additional_headers=headers, proxy=None)  # type: ignore[arg-type]
 
 
-def asked(session: Session, **message) -> dict:
+def asked(session: Session, **message: object) -> dict[str, Any]:
     return json.loads(session.answer(json.dumps({"pane": 0, "ride": 1, **message})))
 
 
@@ -210,7 +212,9 @@ def failing(address: str) -> bool:
 
 
 @pytest.mark.parametrize("opener", [lambda address: False, failing])
-def test_without_a_browser_the_address_is_printed(roster: Roster, monkeypatch: pytest.MonkeyPatch, opener) -> None:
+def test_without_a_browser_the_address_is_printed(
+    roster: Roster, monkeypatch: pytest.MonkeyPatch, opener: Callable[[str], bool]
+) -> None:
     def interrupted(self: LivePage) -> None:
         raise KeyboardInterrupt
 
