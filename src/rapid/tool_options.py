@@ -56,7 +56,7 @@ class Certify:
     """Test spawns, on the way through which the agent decides."""
     returns: SideOrNone = 0
     """Of how many of them the return is bounded too, by the tree of all actions that an attack may bring about."""
-    width: Positive = 256
+    width: Side = 256
     """Worlds of a tree that are followed side by side; where more differ, what is left counts as nothing."""
     scenario: str = ""
     """Where it drives; by default where it was trained."""
