@@ -298,3 +298,16 @@ def test_who_always_brakes_is_proven_to():
     assert found.complete
     assert found.least == pytest.approx(found.clean)
     assert dataclasses.asdict(found)["seed"] == found.seed
+
+
+def test_without_a_place_the_table_is_printed_and_nothing_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    save_agent(tmp_path / "agent", careful().network, {"name": "pupil", "scenario": SCENARIO})
+    monkeypatch.chdir(tmp_path)
+    for radius in ("0.001", "0.002"):
+        with pytest.raises(SystemExit) as ended:
+            main(["certify", "agent", "--decisions", "1", "--spawns", "1", "--radii", radius])
+        assert not ended.value.code
+        assert "Nothing was kept; --out DIRECTORY keeps" in capsys.readouterr().out
+        assert [path.name for path in tmp_path.iterdir()] == ["agent"]

@@ -60,8 +60,8 @@ class Certify:
     """Worlds of a tree that are followed side by side; where more differ, what is left counts as nothing."""
     scenario: str = ""
     """Where it drives; by default where it was trained."""
-    out: str = "certificate"
-    """Directory of the table and the numbers."""
+    out: str = ""
+    """Directory of the table and the numbers; without it the table is printed and nothing is kept."""
     force: bool = False
     """Replace a certificate that is there."""
 

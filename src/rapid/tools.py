@@ -2,6 +2,8 @@
 
 import json
 import sys
+import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast
 
@@ -52,10 +54,14 @@ def certify(options: Certify, config: Config) -> int:
 
     agent = network_agent(options.agent)
     check_road(agent, config.scenario)
-    out, counts = Path(options.out), (options.decisions, options.spawns, options.returns)
-    with exclusive_file(out / "certificate.json"):
+    counts = options.decisions, options.spawns, options.returns
+    with ExitStack() as held:
+        out = Path(options.out or held.enter_context(tempfile.TemporaryDirectory(prefix="rapid-")))
+        held.enter_context(exclusive_file(out / "certificate.json"))
         check_new_file(out / "certificate.json", options.force)
         print(certify(agent, config.scenario, options.radii, *counts, out, options.width), end="")
+    if not options.out:
+        print("Nothing was kept; --out DIRECTORY keeps the table and the numbers.")
     return 0
 
 
