@@ -23,7 +23,17 @@ REQUEST_FILE = "request.json"
 DATASET = ("dataset.json", "transitions.parquet", "teacher_log.parquet", "memory.jsonl", "collecting")
 _RECORD = ("metrics.jsonl", "checkpoint*.safetensors", "tracking-*", "tensorboard", "wandb")
 TRAINING = ("agent", "seed-*", "together", "ppo", *_RECORD)
-EVALUATION = ("parts", "episodes.parquet", "summary.*", "worst.*", "*.png", "*.svg", "adversar*", "sweep.*")
+EVALUATION = (
+    "report.html",
+    "parts",
+    "episodes.parquet",
+    "summary.*",
+    "worst.*",
+    "*.png",
+    "*.svg",
+    "adversar*",
+    "sweep.*",
+)
 
 RUN = ("run.json", "config.toml", "steps", "collect", "mix", "distill", "adapt", "evaluate", "figures", "report.html")
 

@@ -90,6 +90,8 @@ class Import:
     """The scenario, or HighwayEnv's id, whose observations the model reads."""
     out: str = ""
     """The file; by default MODEL.onnx, beside the model."""
+    force: bool = False
+    """Replace another file in its place."""
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,9 @@ def import_agent(options: Import, config: Config) -> int:
     from rapid.agents.sb3 import import_sb3
 
     out = options.out or str(Path(options.model).with_suffix(".onnx"))
-    parity = import_sb3(options.model, out, options.trained_on)
+    with exclusive_file(out):
+        check_new_file(Path(out), options.force)
+        parity = import_sb3(options.model, out, options.trained_on)
     print(
         f"{out}\n{parity.observations} observations of {options.trained_on}: largest difference of values "
         f"{parity.difference:.2g}, the same action on {parity.agreement:.2%}\n"

@@ -79,6 +79,11 @@ def test_the_command_makes_an_agent_that_evaluate_takes(tmp_path: Path, capsys: 
     agent = open_agent(str(tmp_path / "model.onnx"), "lane-3-density-2")
     assert agent.metadata["trained_on"] == FAST
     assert agent.metadata["source"].startswith("stable-baselines3 ")
+    for option, code in ((), 2), (("--force",), 0):
+        with pytest.raises(SystemExit) as ended:
+            main(["import", str(path), *option])
+        assert ended.value.code == code
+        assert ("--force" in capsys.readouterr().err) == bool(code)
 
 
 class _Evil:

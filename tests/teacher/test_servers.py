@@ -1,4 +1,5 @@
 """Servers that answer oddly but lawfully: the client adapts, says once what it gave up, and makes no wrong label."""
+# pyright: basic
 
 import itertools
 import json
@@ -9,6 +10,7 @@ from email.utils import formatdate
 import pytest
 
 from fake_server import Server, answer, completion, refuse
+from rapid.cli import main
 from rapid.config import TeacherConfig
 from rapid.data.card import card
 from rapid.data.collection import collect
@@ -416,7 +418,7 @@ def test_another_model_than_asked_for_is_told(server, capsys):
 def test_the_model_s_own_name_is_recorded_and_on_the_card(server, tmp_path):
     server.acts = [answer({**completion("keep"), "model": "n-2024"})]
     collect(driver(server), "lane-3-density-2-fast", tmp_path, 20, 2)
-    assert set(load_dataset(tmp_path).log.column("served").to_pylist()) == {"n-2024"}
+    assert set(load_dataset(tmp_path).log.column("served").to_pylist()) == {"n-2024"}  # pyright: ignore[reportOptionalMemberAccess]
     assert "The model called itself: n-2024" in card(load_dataset(tmp_path))
 
 
@@ -455,6 +457,23 @@ def test_a_server_that_is_not_there_ends_it_before_anything_is_driven(world):
     config = TeacherConfig(backend="endpoint", model="m", base_url="http://127.0.0.1:9/v1", max_retries=0)
     with pytest.raises(RapidError, match=r"gives no answer: no connection: connection refused\. Nothing was driven"):
         make_teacher(config, 3).decide(world(), [None])
+
+
+@pytest.mark.parametrize("shards", [1, 2])
+def test_where_nothing_was_driven_nothing_is_left_in_the_way(server, tmp_path, monkeypatch, shards):
+    monkeypatch.setenv("RAPID_TEST_KEY", "k")
+    address = {"teacher.backend": "endpoint", "teacher.api-key-env": "RAPID_TEST_KEY", "teacher.max-retries": "0"}
+    sizes = {"teacher-transitions": "10", "shards": str(shards), "lockstep": "1", "out": str(tmp_path / "data")}
+    options = [word for name, value in (address | sizes).items() for word in (f"--{name}", value)]
+    with pytest.raises(SystemExit) as ended:
+        main(["collect", *options, "--teacher.base-url", "http://127.0.0.1:9/v1", "--teacher.model", "wrong"])
+    assert ended.value.code == 2
+    assert not list(tmp_path.iterdir())
+    server.acts = [answer({"data": [{"id": "m"}]}), answer(completion("keep"))]
+    with pytest.raises(SystemExit) as ended:
+        main(["collect", *options, "--teacher.base-url", server.url, "--teacher.model", "m"])
+    assert ended.value.code == 0
+    assert len(load_dataset(tmp_path / "data")) >= 10
 
 
 def test_a_server_that_has_models_but_gives_no_answer(server, world):

@@ -112,7 +112,12 @@ def collect(
             write_json(work / "settings.json", settings, sealed=True)
             (root / DATASET_FILE).unlink()
         run = Collecting(teacher, settings, seeds, work, budget or Budget(), progress, watch)
-        spent = run.collect_until(target, lockstep, make_worlds or _default_worlds(scenario))
+        try:
+            spent = run.collect_until(target, lockstep, make_worlds or _default_worlds(scenario))
+        except BaseException:
+            if not run.begun:
+                _remove(work)  # nothing was decided: other settings may follow
+            raise
         dataset = run.dataset(complete=not spent)
         if not len(dataset):
             raise SpentError(

@@ -119,6 +119,13 @@ class Collecting:
         if progress:
             progress.skip(self.count)
 
+    @property
+    def begun(self) -> bool:
+        """Whether there is anything to go on from, or to tell of."""
+        journals = (path.read_bytes().count(b"\n") for path in self.work.glob("journal*.jsonl"))
+        lost = self.unwritten is not None and self.unwritten.tells
+        return bool(len(self.parts) or self.hindsight.experiences or lost or max(journals, default=0) > 1)
+
     def collect_until(self, target: int | None, lockstep: int, make_worlds: MakeWorlds) -> str:
         """Drive groups until there are `target` transitions, or from all seeds; return the budget spent, or nothing."""
         worlds = _Worlds(make_worlds)

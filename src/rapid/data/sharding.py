@@ -121,7 +121,12 @@ def collect_shards(
             )
             for part in range(1, shards + 1)
         ]
-        unspent = _run(jobs, engine, workers, SOURCES.index(source), progress)
+        try:
+            unspent = _run(jobs, engine, workers, SOURCES.index(source), progress)
+        except BaseException:
+            if before is None and not any(work.glob("shard-*")):
+                _remove(work)  # nothing was decided: other settings may follow
+            raise
         parts = [load_dataset(job.directory) for job in jobs if (job.directory / DATASET_FILE).exists()]
         if not parts:
             raise SpentError(

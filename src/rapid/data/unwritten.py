@@ -62,6 +62,11 @@ class Unwritten:
             self.lost += asked
             self._write()
 
+    @property
+    def tells(self) -> bool:
+        """Whether anything was lost, or is asked for."""
+        return bool(self.lost.decisions or self._asked.decisions)
+
     def ask(self, decisions: Cost) -> None:
         """Write down that these are asked for now."""
         self._asked = decisions
