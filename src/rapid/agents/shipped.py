@@ -22,28 +22,34 @@ def shipped_agents() -> tuple[str, ...]:
     return tuple(sorted(f"{path.parent.parent.name}/{path.name}" for path in found))
 
 
+def shipped_adversaries() -> tuple[str, ...]:
+    """Return the names of the learned adversaries, SCENARIO/adversary-of-NAME, sorted: attacks, no drivers."""
+    found = (path.parent for path in _FOLDER.glob("*/adversaries/*/config.json"))
+    return tuple(sorted(f"{path.parent.parent.name}/{path.name}" for path in found))
+
+
 def is_shipped(path: str | os.PathLike[str]) -> bool:
     """Whether a path is the name of something that comes with the package."""
     return os.fspath(path).startswith(f"{SHIPPED}:")
 
 
 def agent_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the directory that `path` stands for: a shipped agent's after ``shipped:``, else the path itself.
+    """Return the directory that `path` stands for: a shipped agent's or adversary's after ``shipped:``, else itself.
 
     Raises:
-        RapidError: no agent of this name is shipped.
+        RapidError: none of this name is shipped.
     """
     if not is_shipped(path):
         return Path(path)
     name = os.fspath(path).partition(":")[2]
-    known = shipped_agents()
+    known = (*shipped_agents(), *shipped_adversaries())
     if name not in known:
         raise RapidError(
             f"No agent '{name}' is shipped{did_you_mean(name, known)} `rapid agents list` shows them: "
             f"{', '.join(known) or 'none'}."
         )
     scenario, _, agent = name.partition("/")
-    return _FOLDER / scenario / "agents" / agent
+    return _FOLDER / scenario / ("adversaries" if name in shipped_adversaries() else "agents") / agent
 
 
 def card(name: str) -> dict[str, Any]:
@@ -76,4 +82,7 @@ def listing() -> str:
                 str(about.get("summary", "")),
             ]
         )
-    return aligned(lines)
+    attacks = [f"{SHIPPED}:{name}: {card(name).get('summary', '')}" for name in shipped_adversaries()]
+    return "\n".join(
+        [aligned(lines), *(["", "Learned adversaries, for --attacks adversary:NAME", *attacks] if attacks else [])]
+    )
