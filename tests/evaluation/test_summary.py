@@ -70,6 +70,8 @@ def test_units_are_honest_about_trainings() -> None:
     assert "one training each" in summary_text(one, resamples=50)
     three = [replace(row, training_seed=seed) for row in rows_of("rapid") for seed in range(3)]
     assert "Fewer than 5 trainings: preliminary." in summary_text(three, resamples=50)
+    attacked = [replace(row, attack="pgd") for row in rows_of("rapid")]
+    assert "bootstrap intervals over spawn seeds." in summary_text(attacked, resamples=50)
 
 
 def test_who_has_no_values_is_not_attacked_by_search_and_that_is_said() -> None:

@@ -98,7 +98,7 @@ def test_importing_rapid_imports_neither_gymnasium_nor_numpy() -> None:
 
 
 def test_dir_lists_what_the_package_offers() -> None:
-    assert set(rapid.__all__) <= set(dir(rapid))
+    assert set(rapid.__all__) == {name for name in dir(rapid) if not name.startswith("__")} | {"__version__"}
     assert {"make_env", "make_vec", "make_sb3_vec", "load_agent", "load_dataset"} <= set(dir(rapid))
 
 

@@ -9,6 +9,7 @@ from rapid.agents.saved import QAgent
 from rapid.certify.rate import CertifiedReturn, DecisionRates, Reach, certified_return, check_reward, decision_rates
 from rapid.errors import RapidError
 from rapid.evaluation.statistics import Estimate
+from rapid.evaluation.summary import aligned
 from rapid.networks.encoding import feature_scale
 from rapid.progress import task
 from rapid.spawns import spawn_seeds
@@ -83,12 +84,13 @@ def _table(
     lines = [
         f"{agent.name} in {scenario}: {rates[0].decisions} decisions on the way without attack",
         "",
-        f"{'radius':>8}  {'in metres and m/s':<24}  {'unchanged %':<18}  {'safe %':<18}  {'actions':>7}",
     ]
+    rows = [["radius", "in metres and m/s", "unchanged %", "safe %", "actions"]]
     for rate in rates:
         size = f"{x * rate.radius:.3g} m, {y * rate.radius:.2g} m, {v * rate.radius:.2g} m/s"
-        shown = (rate.radius, size, _share(rate.unchanged), _share(rate.safe), rate.reachable)
-        lines.append("{:>8g}  {:<24}  {:<18}  {:<18}  {:>7.2f}".format(*shown))
+        shares = (_share(rate.unchanged), _share(rate.safe))
+        rows.append([f"{rate.radius:g}", size, *shares, f"{rate.reachable:.2f}"])
+    lines.append(aligned(rows))
     lines += [
         "",
         "unchanged: proven that no attack within the radius changes the action. safe: proven that whatever action an",

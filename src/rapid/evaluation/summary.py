@@ -167,9 +167,10 @@ def units(rows: Sequence[SummaryRow]) -> str:
     """Return one sentence on what the intervals are over, and what they say nothing about."""
     learned = [row.metrics["episode_return"] for row in rows if row.kind == "learned"]
     trainings = {of.training_seeds for of in learned if of.training_seeds}
-    counts = sorted({row.metrics["episode_return"].spawns for row in rows})
-    spawns = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else f"{counts[0]}" if counts else "no"
-    sentence = f"Means with 95 % bootstrap intervals over {spawns} spawn seeds"
+    # Who was never driven without attack has none.
+    counts = {row.metrics["episode_return"].spawns for row in rows} - {0}
+    spawns = f"{_span(counts)} spawn seeds" if counts else "spawn seeds"
+    sentence = f"Means with 95 % bootstrap intervals over {spawns}"
     if trainings == {1}:
         return (
             f"{sentence}. Learned rows are one training each: their intervals cover the traffic, not what another "
