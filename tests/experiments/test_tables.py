@@ -8,7 +8,7 @@ import pytest
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import readme, tables
-from rapid.experiments.exhibit import Request
+from rapid.experiments.exhibit import Request, method_drives, rows_of
 from rapid.experiments.exhibits import ALL
 from rapid.experiments.figures import Curve, Lines, Point, Router, save
 from rapid.experiments.methods import METHODS
@@ -193,3 +193,18 @@ def test_a_page_s_blocks_are_filled_from_the_rows_and_an_unknown_block_is_named(
     assert readme.filled(once, store, Path("page.md")) == once
     with pytest.raises(RapidError, match=r"'page.md' has a block 'teacher'; did you mean 'teachers'"):
         readme.filled(page.replace("teachers:strong", "teacher"), store, Path("page.md"))
+
+
+def test_older_rows_stand_in_until_as_many_trainings_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    store = Store(tmp_path / "store", [], RESULTS)
+    drives = method_drives(Request("strong", "full"), METHODS["rapid-robust"], "lane-3-density-2", ("pgd",))
+    legacy = Legacy("strong", "rapid-robust", "lane-3-density-2", "pgd")
+    monkeypatch.setattr(store, "legacy", lambda wanted: rows(21.96, 1))
+    done = {drives[0]}
+    monkeypatch.setattr(store, "is_done", done.__contains__)
+    monkeypatch.setattr(store, "rows", lambda cell: [replace(row, training_seed=cell.seed) for row in rows(20, 1)])
+    assert rows_of(store, drives, legacy) == (rows(21.96, 1), "")
+    done.add(drives[1])
+    found, why = rows_of(store, drives, legacy)
+    assert {row.training_seed for row in found} == {0, 1}
+    assert why == "3 of 5 parts are missing"

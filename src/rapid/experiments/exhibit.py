@@ -77,7 +77,10 @@ def method_drives(request: Request, method: Method, scenario: str, attacks: Sequ
 
 
 def rows_of(store: Store, cells: Sequence[Drive], legacy: Legacy | None = None) -> tuple[list[EpisodeRow], str]:
-    """Return the episodes of some cells and why any is missing; committed rows of before there were cells stand in."""
+    """Return the episodes of some cells and why any is missing.
+
+    Committed rows of before there were cells stand in where they are of as many trainings.
+    """
     found: list[EpisodeRow] = []
     missing = 0
     for cell in cells:
@@ -85,9 +88,13 @@ def rows_of(store: Store, cells: Sequence[Drive], legacy: Legacy | None = None) 
             found += store.rows(cell)
         else:
             missing += 1
-    if missing and legacy and (old := store.legacy(legacy)):
+    if missing and legacy and (old := store.legacy(legacy)) and _trainings(old) >= _trainings(found):
         return old, ""  # never mixed with new ones
     return found, f"{missing} of {len(cells)} parts are missing" if missing else ""
+
+
+def _trainings(rows: Sequence[EpisodeRow]) -> int:
+    return len({row.training_seed for row in rows})
 
 
 def grid(request: Request, store: Store, scenario: str, method: Method, attacks: Sequence[str]) -> tuple[Entry, ...]:
