@@ -4,6 +4,10 @@ The agent's directory is copied to ``src/rapid/shipped/SCENARIO/agents/NAME`` wi
 be exported, its ONNX file.
 
     python benchmarks/ship_agents.py runs/adapted/agent rapid "Best clean return: 300,000 steps, then 700,000 by PPO"
+
+An adversary is measured on its victim, and goes to ``src/rapid/shipped/SCENARIO/adversaries/NAME``.
+
+    python benchmarks/ship_agents.py runs/adversary adversary "..." --victim shipped:lane-3-density-2/robust
 """
 
 import argparse
@@ -35,20 +39,51 @@ LIMITS = (
 
 def scores(rows: list[EpisodeRow]) -> dict[str, Any]:
     """Return mean return with its interval and crash share under each attack, and the worst attack."""
-    found: dict[str, Any] = {}
-    for attack in ATTACKS:
-        here = [row for row in rows if row.attack == attack]
-        if not here:
-            continue
-        returns = estimate(column(here, "episode_return"), [row.seed for row in here])
-        found[attack] = {
-            "return": round(returns.value, 2),
-            "interval": [round(returns.low, 2), round(returns.high, 2)],
-            "crash_share": round(float(np.mean(column(here, "crashed"))), 3),
-            "episodes": len(here),
-        }
+    found = {attack: _score(rows, attack) for attack in ATTACKS if any(row.attack == attack for row in rows)}
     worst = min((attack for attack in found if attack != "none"), key=lambda name: found[name]["return"])
     return found | {"worst": {"attack": worst, **found[worst]}}
+
+
+def _score(rows: list[EpisodeRow], attack: str) -> dict[str, Any]:
+    here = [row for row in rows if row.attack == attack]
+    returns = estimate(column(here, "episode_return"), [row.seed for row in here])
+    return {
+        "return": round(returns.value, 2),
+        "interval": [round(returns.low, 2), round(returns.high, 2)],
+        "crash_share": round(float(np.mean(column(here, "crashed"))), 3),
+        "episodes": len(here),
+    }
+
+
+def ship_adversary(folder: Path, metadata: dict[str, Any], name: str, summary: str, victim: str, spawns: int) -> None:
+    """Measure an adversary on its victim and write its directory."""
+    scenario, attack = str(metadata["scenario"]), f"adversary:{folder}"
+    rows: list[EpisodeRow] = []
+    with task(f"{scenario}/{name}", 2 * spawns, "episodes") as work:
+        for seen in ("none", attack):
+            rows += evaluate_agent(
+                load_agent(victim), scenario, spawn_seeds("test", spawns), (seen,), progress=work.advance
+            )
+    home = PACKAGE / scenario.replace(":", "-") / "adversaries" / name
+    for file in (WEIGHTS_FILE, CONFIG_FILE):
+        write_bytes(home / file, (folder / file).read_bytes())
+    found = {row.attack for row in rows} - {"none"}
+    about = {
+        "name": f"shipped:{home.parents[1].name}/{name}",
+        "summary": summary,
+        "scenario": scenario,
+        "victim": victim,
+        "attack": metadata["attack"],
+        "steps": metadata["steps"],
+        "scores": {"none": _score(rows, "none"), "adversary": _score(rows, found.pop())},
+        "scores_are": f"The victim's, over {spawns} test spawns.",
+        "weights_sha256": read_json(home / CONFIG_FILE, "agent")["weights_sha256"],
+        "commit": commit(),
+        "licence": "Apache-2.0",
+        "limits": "It attacks the agent named, with these weights, in the scenario named, and is no driver.",
+    }
+    write_json(home / CARD_FILE, about)
+    print(f"{home}: {about['scores']}")
 
 
 def main() -> None:
@@ -60,8 +95,12 @@ def main() -> None:
     parser.add_argument("--scenario", default="", help="by default the one that it was trained in")
     parser.add_argument("--spawns", type=int, default=200, help="test spawns")
     parser.add_argument("--work", type=Path, default=Path("runs/ship"), help="where the rows are kept")
+    parser.add_argument("--victim", default="", help="the agent that an adversary was trained against")
     chosen = parser.parse_args()
     agent = load_agent(chosen.agent)
+    if chosen.victim:
+        ship_adversary(chosen.agent, agent.metadata, chosen.name, chosen.summary, chosen.victim, chosen.spawns)
+        return
     scenario = chosen.scenario or str(agent.metadata["scenario"])
     rows: list[EpisodeRow] = []
     seeds = spawn_seeds("test", chosen.spawns)

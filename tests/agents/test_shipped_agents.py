@@ -7,9 +7,9 @@ import pytest
 import rapid
 from rapid.agents.onnx import OnnxAgent
 from rapid.agents.open import open_agent, own_scenario
-from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, card, listing, shipped_agents
+from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, card, listing, shipped_adversaries, shipped_agents
 from rapid.errors import RapidError
-from rapid.evaluation.rollouts import run_episodes
+from rapid.evaluation.rollouts import evaluate_agent, run_episodes
 from rapid.files import sha256
 from rapid.spawns import spawn_seeds
 
@@ -58,3 +58,16 @@ def test_names_are_taken_wherever_an_agent_is_expected():
 def test_cards_are_json_that_a_reader_can_use():
     for name in NAMES:
         assert json.loads(Path(agent_folder(f"shipped:{name}") / CARD_FILE).read_text())["licence"] == "Apache-2.0"
+
+
+@pytest.mark.parametrize("name", shipped_adversaries())
+def test_a_shipped_adversary_attacks_the_agent_that_its_card_names_and_no_other(name: str):
+    about = card(name)
+    assert about["weights_sha256"] == sha256(agent_folder(f"shipped:{name}") / "weights.safetensors")
+    assert f"shipped:{name}: {about['summary']}" in listing()
+    victim, seeds = rapid.load_agent(about["victim"]), spawn_seeds("tune", 2)
+    attack = f"adversary:shipped:{name}"
+    assert {row.attack for row in evaluate_agent(victim, about["scenario"], seeds, (attack,))} == {attack}
+    other = rapid.load_agent(f"shipped:{about['scenario']}/distilled")
+    with pytest.raises(RapidError, match="was trained against another agent"):
+        evaluate_agent(other, about["scenario"], seeds, (attack,))
