@@ -1,5 +1,6 @@
 """Shared by all tests: one thread, and observations as a road gives them."""
 
+import os
 import signal
 from collections.abc import Iterator
 from typing import Any
@@ -11,6 +12,8 @@ from torch import Tensor
 import browser
 
 torch.set_num_threads(1)
+# Ray's workers are as polite as can be by default, and starve where another program runs beside the tests.
+os.environ.setdefault("RAY_worker_niceness", "0")
 
 
 class Roads:
