@@ -8,8 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
@@ -88,18 +88,18 @@ def legacy_rows(results: Path, wanted: Legacy) -> list[EpisodeRow]:
     if wanted.recipe == "paper" and wanted.attack != "none":
         return []
     labels = [label for label, method in LABELS.get(wanted.recipe, {}).items() if method == wanted.method]
+    if not labels:
+        return []
     found: list[EpisodeRow] = []
     for name in FILES.get(wanted.recipe, ()):
         path = results / name
         if not path.is_file():
             continue
         table = _table(path, wanted.recipe)
-        agents, scenarios, attacks, seeds = (
-            table.column(name).to_numpy() for name in ("agent", "scenario", "attack", "seed")
-        )
-        keep = np.isin(agents, labels) & (scenarios == wanted.scenario) & (attacks == wanted.attack)
-        keep &= (seeds >= SPAWNS[0]) & (seeds <= SPAWNS[-1])
-        found += rows_of_table(table.take(np.flatnonzero(keep)), path)
+        seed = pc.field("seed")
+        keep = pc.field("agent").isin(labels) & (pc.field("scenario") == wanted.scenario)
+        keep &= (pc.field("attack") == wanted.attack) & (seed >= SPAWNS[0]) & (seed <= SPAWNS[-1])
+        found += rows_of_table(table.filter(keep), path)
     return found
 
 
