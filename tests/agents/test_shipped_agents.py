@@ -71,3 +71,5 @@ def test_a_shipped_adversary_attacks_the_agent_that_its_card_names_and_no_other(
     other = rapid.load_agent(f"shipped:{about['scenario']}/distilled")
     with pytest.raises(RapidError, match="was trained against another agent"):
         evaluate_agent(other, about["scenario"], seeds, (attack,))
+    with pytest.raises(RapidError, match="drives nothing itself"):
+        open_agent(f"shipped:{name}", about["scenario"])

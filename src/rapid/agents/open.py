@@ -90,7 +90,13 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
             return PlannerAgent()
         return CarsPlanner(seed=seed) if spec == "planner-cars" else ObservationPlanner(scenario, seed=seed)
     if is_shipped(spec) or Path(spec).is_dir():
-        return rapid.load_agent(spec, device)
+        agent = rapid.load_agent(spec, device)
+        if agent.metadata.get("adversary_of"):
+            raise RapidError(
+                f"'{spec}' is an adversary, which attacks a driver and drives nothing itself. Give the agent that it "
+                f"was trained against, with --attacks adversary:{spec}."
+            )
+        return agent
     if Path(spec).suffix == ".onnx":
         from rapid.agents.onnx import OnnxAgent
 
