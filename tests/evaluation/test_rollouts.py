@@ -238,9 +238,9 @@ def test_what_cannot_drive_is_named(toy, agent: Any, match: str) -> None:
 
 
 def test_a_saved_agent_goes_to_the_device(monkeypatch):
-    asked = []
-    monkeypatch.setattr(rapid, "load_agent", lambda directory, device: asked.append((directory, device)))
-    open_agent(".", SCENARIO, device="cuda")
+    asked, saved = [], SimpleNamespace(metadata={})
+    monkeypatch.setattr(rapid, "load_agent", lambda directory, device: asked.append((directory, device)) or saved)
+    assert open_agent(".", SCENARIO, device="cuda") is saved
     assert asked == [(".", "cuda")]
 
 
