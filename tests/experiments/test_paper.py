@@ -1,7 +1,12 @@
 """The transcription of the paper's tables: complete, and consistent wherever two tables print the same number."""
 
 import itertools
+from dataclasses import replace
 
+import pytest
+
+from rapid.attacks.spec import NAMED, parse_attack
+from rapid.experiments.exhibit import Request
 from rapid.experiments.paper import paper_numbers, paper_result
 from rapid.presets import preset
 from rapid.scenarios import PAPER_SCENARIOS, TARGET_SPEEDS, get_scenario
@@ -58,3 +63,13 @@ def test_our_settings_are_the_papers() -> None:
 def test_what_the_paper_does_not_have_is_none() -> None:
     assert paper_result("attack", "none", scenario="lane-9-density-9", method="RAPID") is None
     assert paper_result("attack", "strange", scenario="lane-3-density-2", method="RAPID") is None
+
+
+@pytest.mark.parametrize("recipe", ["paper", "strong"])
+def test_our_attacks_are_the_papers(recipe) -> None:
+    for name in ATTACKS:
+        text = Request(recipe, "full").attack(name)
+        spec = parse_attack(text)
+        assert spec.name == text
+        free = recipe == "paper" and name != "none"
+        assert spec == replace(NAMED[name], presence="free" if free else "masked"), text

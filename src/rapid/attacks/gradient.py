@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rapid.config import RobustConfig
+from rapid.networks.denormals import no_denormals
 
 ROUNDING = 1e-5
 """Share of the radius left free, so that float32 metres, read back, still lie inside the ball."""
@@ -40,7 +41,7 @@ def maximize_loss(
         generator: for the random start.
     """
     # Evaluation calls this from inference mode, in which no gradient could be taken.
-    with torch.inference_mode(False), torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad(), no_denormals():
         obs_BVF, labels_BA = obs_BVF.detach().clone(), labels_BA.detach().clone()
         free_F = torch.ones_like(scale_F)
         if not config.attack_presence:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rapid.attacks.draws import Source, chosen, normal, uniform
+from rapid.networks.denormals import no_denormals
 
 Values = Callable[[Tensor], Tensor]
 """Raw observations (B, V, F) to Q-values (B, A)."""
@@ -178,7 +179,7 @@ def for_gradients(values: Values) -> Generator[None]:
     """Allow gradients by the observations, and spare those by the weights."""
     module: Any = values.network if isinstance(values, AtState) else values
     weights = [p for p in module.parameters() if p.requires_grad] if isinstance(module, nn.Module) else []
-    with torch.inference_mode(False), torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad(), no_denormals():
         for weight in weights:
             weight.requires_grad_(False)
         try:

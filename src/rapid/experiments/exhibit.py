@@ -1,9 +1,10 @@
 """What an exhibit is: a table or figure as the cells that it needs and how it is shown; and comparisons of methods."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+from rapid.attacks.spec import NAMED
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import methods as make
 from rapid.experiments import words
@@ -39,8 +40,13 @@ class Request:
         return range(make.EFFORTS[self.scale].seeds)
 
     def attack(self, name: str) -> str:
-        """Return an attack's text: the recipe `paper` lets presence be attacked (docs/deviations.md)."""
-        return f"{name}:presence=free" if self.recipe == "paper" and name != "none" else name
+        """Return an attack's text: the recipe `paper` lets presence be attacked (docs/deviations.md).
+
+        The attack stays the paper's: `pgd:presence=free` would be the kind's 50 steps from five starts.
+        """
+        if self.recipe != "paper" or name == "none":
+            return name
+        return replace(NAMED[name], presence="free").name
 
 
 @dataclass(frozen=True)
