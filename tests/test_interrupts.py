@@ -74,7 +74,7 @@ def test_ctrl_c_is_one_sentence_whenever_it_comes(tmp_path: Path, seconds: float
     code, said = press(process)
     # Python itself ends by the signal if it came while C code ran text as Python; to a shell that is 130 as well.
     assert code in (130, -signal.SIGINT)
-    assert "rapid: interrupted. What is done is kept" in said
+    assert "rapid: interrupted; what is done is kept. The same command goes on." in said
     assert "Traceback" not in said
     assert "Error" not in said
 
@@ -99,6 +99,35 @@ def test_a_training_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path: Path)
     subprocess.run([*whole[:-1], "cut"], cwd=tmp_path, check=True, capture_output=True)
     ours, theirs = ((tmp_path / out / "agent" / "weights.safetensors").read_bytes() for out in ("cut", "whole"))
     assert ours == theirs
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("run", "--scale", "tiny"), "; what is done is kept. The same command, without --from, goes on."),
+        (("distill", "data"), "; what is done is kept. The same command goes on."),
+        (("evaluate", "agent", "--out", "x"), "; what is done is kept. The same command goes on."),
+        (("evaluate", "agent", "--out=x"), "; what is done is kept. The same command goes on."),
+        (("evaluate", "agent"), "."),
+        (("play",), "."),
+        (("doctor",), "."),
+    ],
+)
+@pytest.mark.parametrize(
+    ("stop", "begins"),
+    [
+        (KeyboardInterrupt(), "\nrapid: interrupted"),
+        (termination.StoppedError("what is done is kept"), "rapid: told to end"),
+    ],
+)
+def test_only_what_goes_on_is_said_to(monkeypatch, capsys, words, says: str, stop: BaseException, begins: str):
+    def end(words: list[str]) -> int:
+        raise stop
+
+    monkeypatch.setattr(cli, "_call", end)
+    with pytest.raises(SystemExit):
+        cli.main(words)
+    assert capsys.readouterr().err == f"{begins}{says}\n"
 
 
 def _size(path: Path) -> int:

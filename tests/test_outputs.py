@@ -142,6 +142,26 @@ def test_every_verb_leaves_what_another_made_and_says_what_differs(
     assert contents(tmp_path) != before
 
 
+def test_collect_without_a_place_goes_beside_what_was_collected_with_other_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    driver = COLLECT.index("slower")
+    assert run(*COLLECT) == 0
+    first = contents(tmp_path)
+    assert run(*COLLECT[:driver], "random", *COLLECT[driver + 1 :], "--random-transitions", "30") == 0
+    assert {path.name for path in Path("data").iterdir()} == {"teacher", "random"}
+    for _ in range(2):  # the same command goes on at the same place
+        assert run(*COLLECT[:driver], "idle", *COLLECT[driver + 1 :]) == 0
+        (beside,) = {path.name for path in Path("data").iterdir()} - {"teacher", "random"}
+        assert beside.startswith("teacher-")
+        assert f"30 transitions in data/{beside}" in capsys.readouterr().out
+    # A place that is named is the user's choice: nothing goes elsewhere.
+    assert run(*COLLECT[:driver], "faster", *COLLECT[driver + 1 :], "--out", "data/teacher") == 2
+    assert len(list(Path("data").iterdir())) == 3
+    assert {name: held for name, held in contents(tmp_path).items() if name.startswith("data/teacher/")} == first
+
+
 def test_a_file_of_the_users_is_not_collected_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _say(f"rapid: {error}")
         raise SystemExit(2) from None
     except termination.StoppedError as stopped:
-        _say(f"rapid: told to end; {stopped}. The same command, without --from, goes on.")
+        _say(f"rapid: told to end{_going_on(words, str(stopped))}.")
         raise SystemExit(termination.EXIT_CODE) from None
     except BrokenPipeError:
         # The reader of our output went away (`rapid ... | head`): not an error of ours.
@@ -106,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         if termination.interrupted() or isinstance(error, KeyboardInterrupt):
             termination.quietly()
-            _say("\nrapid: interrupted. What is done is kept: the same command, without --from, goes on.")
+            _say(f"\nrapid: interrupted{_going_on(words, 'what is done is kept')}.")
             raise SystemExit(130) from None
         if isinstance(error, OSError):
             _say(f"rapid: The system refused: {error}. Check the path, its permissions and the free space.")
@@ -116,6 +116,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise SystemExit(2) from None
         raise
     raise SystemExit(code)
+
+
+_GO_ON = ("run", "collect", "distill", "adapt", "adversary", "evaluate", "teach-bench", "reproduce")
+"""Verbs that go on where they were ended."""
+
+
+def _going_on(words: Sequence[str], kept: str) -> str:
+    """Return what is `kept` of a verb that was ended, and how it goes on; nothing where nothing is."""
+    verb = words[0]
+    if verb not in _GO_ON or (verb == "evaluate" and not any(word.startswith("--out") for word in words)):
+        return ""
+    return f"; {kept}. The same command{', without --from,' if verb == 'run' else ''} goes on"
 
 
 def _call(words: Sequence[str]) -> int:

@@ -75,8 +75,9 @@ class Collect:
 
     collect: Flat[CollectConfig] = field(default_factory=CollectConfig)
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
-    out: str = "data/teacher"
-    """Directory of the dataset."""
+    out: str = ""
+    """Directory of the dataset; by default data/teacher, or data/random of the random driver, or a directory with a
+    hash beside it if that was collected with other settings."""
     force: bool = False
     """Replace what another command made in the place of the output."""
     scenario: str = Config.scenario

@@ -39,15 +39,24 @@ RUN = ("run.json", "config.toml", "steps", "collect", "mix", "distill", "adapt",
 
 
 class ClashError(RapidError):
-    """A place is taken by something else."""
+    """A place is taken by something else; `wanted` are the settings that would have had it, where they are known."""
+
+    def __init__(self, message: str, wanted: dict[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.wanted = wanted
 
 
 def place_for(usual: str, request: dict[str, Any]) -> Path:
     """Return where a command goes that was given no place: `usual`, or a directory beside it if that is taken."""
-    place, other = Path(usual), Path(f"{usual}-{content_hash(_plain(request))[:8]}")
+    place, other = Path(usual), beside(usual, request)
     if other.exists() or (place.exists() and (not place.is_dir() or _clash(place, _plain(request)))):
         return other
     return place
+
+
+def beside(usual: str, request: dict[str, Any]) -> Path:
+    """Return the directory beside `usual` that is named after what is asked for."""
+    return Path(f"{usual}-{content_hash(_plain(request))[:8]}")
 
 
 @contextmanager

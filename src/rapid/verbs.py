@@ -29,7 +29,7 @@ from rapid.options import (
     Relabel,
     Run,
 )
-from rapid.outputs import DATASET, TRAINING, ClashError, claimed, clear, place_for
+from rapid.outputs import DATASET, TRAINING, ClashError, beside, claimed, clear, place_for
 from rapid.parsing import parse
 from rapid.presets import preset
 from rapid.scenarios import get_scenario
@@ -93,16 +93,21 @@ def _collect(options: Collect, config: Config) -> int:
     check(config)
     # The random driver's transitions are the other source of a mixture, from spawns of their own.
     uniform = (config.teacher.backend, config.teacher.model) == ("scripted", "random")
-    out, source = Path(options.out), cast(TrainPart, "random" if uniform else "teacher")
-    with exclusive(out):
-        try:
+    source = cast(TrainPart, "random" if uniform else "teacher")
+    out = Path(options.out or f"data/{source}")
+    try:
+        with exclusive(out):
             dataset = collect_transitions(config, out, source)
-        except ClashError:
-            if not options.force:
+    except ClashError as clash:
+        if not options.force:
+            if options.out or clash.wanted is None:
                 raise
-            clear(out, DATASET)
+            out = beside(str(out), clash.wanted)
+        with exclusive(out):
+            if options.force:
+                clear(out, DATASET)
             dataset = collect_transitions(config, out, source)
-    print(f"{len(dataset)} transitions in {options.out}")
+    print(f"{len(dataset)} transitions in {out}")
     if not (dataset.collection or {}).get("complete", True):
         print("The budget is spent; the same command with a larger one goes on.", file=sys.stderr)
     _tell_fallbacks(dataset)

@@ -141,6 +141,62 @@ def test_what_the_second_interruption_lets_go_is_counted(server: Server, tmp_pat
     assert lost_in(go_on(server, tmp_path).collection).decisions == 3
 
 
+def test_turns_that_were_paid_for_are_counted_where_a_conversation_ends_between_two(server: Server, tmp_path: Path):
+    """The first interruption lets the requests under way end and begins no other: here, the second turns."""
+    call = {"id": "1", "type": "function", "function": {"name": "get_available_actions", "arguments": "{}"}}
+    turn, pressed = answer(completion(None, tool_calls=[call])), threading.Event()
+
+    def first_turn(handler: Any, request: Any) -> None:
+        if len(server.requests) > 4:  # the fourth of the second step
+            if len(server.requests) == 8:
+                os.kill(os.getpid(), signal.SIGINT)
+                pressed.set()
+            assert pressed.wait(30)
+            time.sleep(0.5)
+            turn(handler, request)
+        else:
+            answer(completion())(handler, request)
+
+    server.acts = [first_turn]
+    with pytest.raises(KeyboardInterrupt):
+        collect(driver(server, style="react"), SCENARIO, tmp_path, 120, 4)
+    assert len(server.requests) == 8
+    server.acts = [answer(completion())]
+    data = collect(driver(server, style="react"), SCENARIO, tmp_path, 120, 4)
+    usage = completion()["usage"]
+    assert lost_in(data.collection) == Cost(4, 4 * (usage["prompt_tokens"] + usage["completion_tokens"]), 0.0)
+
+
+def test_lessons_that_were_asked_for_are_counted(server: Server, tmp_path: Path):
+    """Crashes are looked back on; the one that is asked about when the user wants no more is paid for and lost."""
+    stuck, looked = Stuck(0), threading.Event()
+
+    def act(handler: Any, request: Any) -> None:
+        if "lesson" in json.dumps(request):
+            looked.set()
+            return stuck(handler, request)
+        return answer(completion("faster"))(handler, request)
+
+    def press() -> None:
+        assert looked.wait(60)
+        for _ in range(2):
+            time.sleep(0.3)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    server.acts = [act]
+    presses = threading.Thread(target=press)
+    presses.start()
+    with pytest.raises(KeyboardInterrupt):
+        collect(driver(server, reflect=True), SCENARIO, tmp_path, 120, 4)
+    presses.join()
+    stuck.open.set()
+    server.acts = [answer(completion("keep"))]
+    data = collect(driver(server, reflect=True), SCENARIO, tmp_path, 120, 4)
+    lost = lost_in(data.collection)
+    assert lost.decisions >= 1
+    assert lost.tokens > 0
+
+
 def test_what_the_end_of_the_time_lets_go_is_counted_and_spent(server: Server, tmp_path: Path):
     stuck = Stuck(8)
     server.acts = [stuck]

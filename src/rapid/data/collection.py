@@ -147,7 +147,7 @@ def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
     elif (work / JOURNAL_FILE).exists() or any(work.glob("part-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
     else:
-        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE))
+        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE), settings)
     check_settings(root, before, settings)
     if dataset is None or not dataset.collection or not dataset.collection["complete"]:
         if dataset is not None and not (work / "settings.json").exists():

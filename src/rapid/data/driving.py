@@ -3,7 +3,8 @@
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -244,31 +245,45 @@ class Collecting:
         decisions = journal.kept(len(seen))
         wanted = [place for place, decision in enumerate(decisions) if decision is None]
         made: Sequence[Decision | None] = []
-        let_go = 0
-        if self.unwritten:
-            share = len(wanted) / max(self.decisions, 1)
-            self.unwritten.ask(Cost(len(wanted), round(self.tokens * share), self.cost * share))
-        try:
-            made = self.teacher.decide(seen[wanted], [previous[place] for place in wanted], keys[wanted])
-        except (UnfinishedError, InterruptedDecisions) as broken_off:
-            let_go = broken_off.let_go
-            made = [None if decision and decision.unanswered else decision for decision in broken_off.decisions]
-            raise
-        except UnreachableError:
-            # What the rule decided just before, while the server was already gone, is asked again.
-            journal.forget_end(lambda decision: decision.unanswered)
-            raise
-        finally:
-            for place, decision in zip(wanted, made, strict=False):
-                decisions[place] = decision
-            fresh = sum(decision is not None for decision in made)
-            if fresh:
-                journal.append(seen, decisions)
-                self.fresh += fresh
-            # Told to end by a signal, it waits for nothing: that is as a kill.
-            if self.unwritten and not isinstance(sys.exception(), TerminatedError):
-                self.unwritten.settle(let_go)
+        with self._asked(len(wanted), known := list[Decision]()):
+            try:
+                made = self.teacher.decide(seen[wanted], [previous[place] for place in wanted], keys[wanted])
+            except (UnfinishedError, InterruptedDecisions) as broken_off:
+                made = [None if decision and decision.unanswered else decision for decision in broken_off.decisions]
+                raise
+            except UnreachableError:
+                # What the rule decided just before, while the server was already gone, is asked again.
+                journal.forget_end(lambda decision: decision.unanswered)
+                raise
+            finally:
+                for place, decision in zip(wanted, made, strict=False):
+                    decisions[place] = decision
+                known += [decision for decision in made if decision is not None]
+                if known:
+                    journal.append(seen, decisions)
+                    self.fresh += len(known)
         return [decision for decision in decisions if decision is not None]
+
+    @contextmanager
+    def _asked(self, count: int, known: Sequence[Decision] = ()) -> Generator[None]:
+        """Keep on disk that so many decisions are asked for, and afterwards what was lost; `known` are those made."""
+        if not self.unwritten or not isinstance(self.teacher, Timed):
+            yield
+            return
+        before = self.teacher.lost
+        self.unwritten.ask(self._guess(count))
+        try:
+            yield
+        finally:
+            # Told to end by a signal, it waits for nothing: that is as a kill.
+            if not isinstance(sys.exception(), TerminatedError):
+                self.unwritten.settle(self._guess(self.teacher.lost - before, known))
+
+    def _guess(self, count: int, more: Sequence[Decision] = ()) -> Cost:
+        """Return what so many decisions cost, by the mean of those that were made, `more` among them."""
+        share = count / max(self.decisions + (self.unwritten.lost.decisions if self.unwritten else 0) + len(more), 1)
+        tokens = self.tokens + sum(decision.tokens_in + decision.tokens_out for decision in more)
+        return Cost(count, round(tokens * share), (self.cost + sum(decision.cost for decision in more)) * share)
 
     def _look_back(self) -> None:
         """Let a teacher that reflects learn from the finished episodes, once from each."""
@@ -276,8 +291,10 @@ class Collecting:
             part = self.parts.tables[self.looked_back]
             if part is not None and (episodes := self.hindsight.pending(part)):
                 self._check_budget(0)
-                for experience in self.hindsight.look_back(episodes):
-                    self._charge(experience)
+                # Only a crash is asked about.
+                with self._asked(sum(episode.crashed for episode in episodes)):
+                    for experience in self.hindsight.look_back(episodes):
+                        self._charge(experience)
             self.looked_back += 1
 
     def _charge(self, experience: Experience) -> None:

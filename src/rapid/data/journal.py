@@ -171,11 +171,12 @@ def check_settings(root: Path, before: dict[str, Any] | None, settings: dict[str
     if before is not None and before != settings:
         raise ClashError(
             f"'{root}' was collected with other settings: {differences(before, settings)}. Nothing was changed. Use "
-            "the same settings to go on, choose another directory, or replace what is there with --force."
+            "the same settings to go on, choose another directory, or replace what is there with --force.",
+            settings,
         )
 
 
-def check_unclaimed(root: Path, names: Sequence[str]) -> None:
+def check_unclaimed(root: Path, names: Sequence[str], settings: dict[str, Any]) -> None:
     """Raise unless a directory in which nothing was collected is free of files that a dataset would replace.
 
     Raises:
@@ -184,5 +185,6 @@ def check_unclaimed(root: Path, names: Sequence[str]) -> None:
     if found := [name for name in names if (root / name).exists()]:
         raise ClashError(
             f"'{root}' holds {found[0]}, but nothing says that it was collected there. Nothing was changed. Choose "
-            "another directory, or replace what is there with --force."
+            "another directory, or replace what is there with --force.",
+            settings,
         )

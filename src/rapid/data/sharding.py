@@ -309,7 +309,7 @@ def _check_same(root: Path, settings: dict[str, Any], dataset: Dataset | None) -
     elif any(work.glob("shard-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
     else:
-        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE))
+        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE), settings)
     check_settings(root, before, settings)
 
 

@@ -72,12 +72,10 @@ class Unwritten:
         self._asked = decisions
         self._write()
 
-    def settle(self, lost: int) -> None:
-        """Write down that what was asked for is in the journal, but for so many decisions."""
-        asked, self._asked = self._asked, Cost()
-        if lost:
-            share = lost / asked.decisions
-            self.lost += Cost(lost, round(asked.tokens * share), asked.cost * share)
+    def settle(self, lost: Cost) -> None:
+        """Write down that what was asked for is in the journal, but for what was `lost`."""
+        self._asked = Cost()
+        self.lost += lost
         self._write()
 
     def _write(self) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -195,7 +196,13 @@ def _in_lockstep(
         while given in results:
             yield results.pop(given)
             given += 1
-        answers = dict(zip(waiting, answer(list(waiting.values())), strict=True)) if waiting else {}
+        try:
+            answers = dict(zip(waiting, answer(list(waiting.values())), strict=True)) if waiting else {}
+        except StoppedError as stopped:
+            for number in waiting:
+                with suppress(StoppedError):  # it learns of it, in case that something was paid for it already
+                    conversations[number].throw(stopped)
+            raise
 
 
 def _answer(chat: Chat, request: Request) -> Reply | ChatError:

@@ -70,6 +70,8 @@ class _Talk:
     answer: str = ""
     tokens: tuple[Token, ...] = ()
     served: str = ""
+    turns: int = 0
+    """Answers that came."""
     faults: list[str] = field(default_factory=list[str])
 
     def note(self, reply: Reply) -> None:
@@ -77,6 +79,7 @@ class _Talk:
         self.tokens_out += reply.tokens_out
         self.retries += reply.retries
         self.answer, self.tokens, self.served = reply.text, reply.tokens, reply.model
+        self.turns += 1
 
 
 def _opening(prompt: Prompt) -> list[Message]:
@@ -143,12 +146,26 @@ class ConversingTeacher:
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
         """Give one experience for each episode; see :class:`rapid.teacher.memory.Reflective`."""
+        broken_off = False
+        # To its end, where it raises what broke it off.
         for result in self._lead([self._look_back(episode) for episode in episodes]):
             if result is None:
-                raise StoppedError(self._patience.reason)
-            experience, fault = result
-            self._watch(fault)
-            yield experience
+                broken_off = True
+            elif broken_off:
+                # A memory is in the order of its episodes: what comes after a gap is asked again.
+                if result[0].tokens_in:
+                    self._patience.lose()
+            else:
+                experience, fault = result
+                self._watch(fault)
+                yield experience
+        if broken_off:
+            raise StoppedError(self._patience.reason)
+
+    @property
+    def lost(self) -> int:
+        """Decisions and lessons that were broken off although something may have been paid for them."""
+        return self._patience.lost
 
     def end_by(self, moment: float, reason: str) -> None:
         """Wait for nothing beyond `moment`; see :class:`rapid.teacher.decision.Timed`."""
@@ -179,15 +196,14 @@ class ConversingTeacher:
     def _all_of(self, conversations: Sequence[Conversation[Decision]]) -> list[Decision]:
         """Return what came of all conversations; whoever breaks them off is handed what came until then."""
         made: list[Decision | None] = []
-        before = self._patience.let_go
         try:
             made.extend(self._lead(conversations))
         except KeyboardInterrupt:
             all_of = [*made, *[None] * (len(conversations) - len(made))]
-            raise InterruptedDecisions(all_of, self._patience.let_go - before) from None
+            raise InterruptedDecisions(all_of) from None
         decisions = [decision for decision in made if decision is not None]
         if len(decisions) < len(made):
-            raise UnfinishedError(self._patience.reason, made, self._patience.let_go - before)
+            raise UnfinishedError(self._patience.reason, made)
         return decisions
 
     def _lead(self, conversations: Sequence[Conversation[T]]) -> Iterator[T | None]:
@@ -221,6 +237,9 @@ class ConversingTeacher:
                 choice = read_lesson(reply.text, facts, _was_cut(reply))
         except ChatError as error:
             lost = f"{NO_ANSWER}: {error}"
+        except StoppedError as stopped:
+            self._count_turns(talk, stopped)
+            raise
         if choice.action is not None:
             # The reason was that of the decision that led to the crash.
             experience = dataclasses.replace(
@@ -228,6 +247,11 @@ class ConversingTeacher:
             )
         spent = {"tokens_in": talk.tokens_in, "tokens_out": talk.tokens_out, "cost": self._cost(talk)}
         return dataclasses.replace(experience, **spent), lost
+
+    def _count_turns(self, talk: _Talk, stopped: StoppedError) -> None:
+        """Count a conversation that ends between two turns; a request under way has been counted."""
+        if talk.turns and not stopped.under_way:
+            self._patience.lose()
 
     def _cost(self, talk: _Talk) -> float:
         return (talk.tokens_in * self._config.price_in + talk.tokens_out * self._config.price_out) / 1e6
@@ -245,6 +269,9 @@ class ConversingTeacher:
         except ChatError as error:
             talk.retries += error.retries
             talk.faults.append(f"{NO_ANSWER}: {error}")
+        except StoppedError as stopped:
+            self._count_turns(talk, stopped)
+            raise
         status, action, computed, probabilities = "repaired" if talk.faults else "ok", choice.action, "", None
         if action is None:
             action, status = safest(facts), "fallback"

@@ -26,25 +26,19 @@ class UnreachableError(RapidError):
 
 
 class UnfinishedError(StoppedError):
-    """The time was over before all worlds were decided for; `decisions` holds those that were, and None.
+    """The time was over before all worlds were decided for; `decisions` holds those that were, and None."""
 
-    So many requests under way were `let_go`.
-    """
-
-    def __init__(self, message: str, decisions: Sequence["Decision | None"], let_go: int = 0) -> None:
+    def __init__(self, message: str, decisions: Sequence["Decision | None"]) -> None:
         super().__init__(message)
-        self.decisions, self.let_go = decisions, let_go
+        self.decisions = decisions
 
 
 class InterruptedDecisions(KeyboardInterrupt):
-    """The user interrupted; `decisions` holds those that were made all the same, and None for the others.
+    """The user interrupted; `decisions` holds those that were made all the same, and None for the others."""
 
-    So many requests under way were `let_go`.
-    """
-
-    def __init__(self, decisions: Sequence["Decision | None"], let_go: int = 0) -> None:
+    def __init__(self, decisions: Sequence["Decision | None"]) -> None:
         super().__init__()
-        self.decisions, self.let_go = decisions, let_go
+        self.decisions = decisions
 
 
 @dataclass(frozen=True)
@@ -121,6 +115,11 @@ class Teacher(Protocol):
 @runtime_checkable
 class Timed(Protocol):
     """A teacher that waits for others."""
+
+    @property
+    def lost(self) -> int:
+        """Decisions that were broken off although something may have been paid for them."""
+        ...
 
     def end_by(self, moment: float, reason: str) -> None:
         """Wait for nothing beyond `moment` (of :func:`time.monotonic`); `reason` is a sentence.

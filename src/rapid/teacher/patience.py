@@ -19,6 +19,9 @@ _SILENCES = (10.0, 30.0, 60.0)
 class StoppedError(RapidError):
     """No answer was waited for any longer: the time for all of them is over, or the user wants an end."""
 
+    under_way = False
+    """Whether a request was under way, and was let go."""
+
 
 class Flight:
     """One request under way."""
@@ -56,8 +59,8 @@ class Patience:
         self._heard = time.monotonic()
         self._slowest = self._silence = 0.0
         self._words = 0
-        self.let_go = 0
-        """Requests that were under way when nothing was waited for any longer."""
+        self.lost = 0
+        """Decisions that were broken off although something may have been paid for them."""
 
     @property
     def begin_until(self) -> float:
@@ -85,6 +88,11 @@ class Patience:
         """Forget :meth:`stop` and :meth:`drop`; a limit in time stays."""
         self._stopped = self._dropped = False
 
+    def lose(self) -> None:
+        """Count a decision that is broken off although something may have been paid for it."""
+        with self._lock:
+            self.lost += 1
+
     def check(self) -> None:
         """Raise StoppedError if no request may begin any more."""
         if time.monotonic() >= self.begin_until:
@@ -111,9 +119,9 @@ class Patience:
             yield flight
             with self._lock:
                 self._slowest = max(self._slowest, time.monotonic() - flight.start)
-        except StoppedError:
-            with self._lock:
-                self.let_go += 1
+        except StoppedError as stopped:
+            stopped.under_way = True
+            self.lose()
             raise
         finally:
             with self._lock:
