@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from rapid.bounds import check_bounds
-from rapid.config import Config, NetworkConfig, PpoConfig
+from rapid.config import Config
+from rapid.config_learning import NetworkConfig, PpoConfig
 from rapid.errors import RapidError, did_you_mean
 from rapid.safety import read_box
 from rapid.scenarios import NUM_ACTIONS, get_scenario

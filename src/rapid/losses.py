@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rapid.attacks.gradient import maximize_loss
-from rapid.config import LossConfig
+from rapid.config_learning import LossConfig
 from rapid.data.batch import TransitionBatch
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork

@@ -9,19 +9,8 @@ from typing import Annotated, TypeVar
 from tyro.conf import Positional, arg
 
 from rapid.bounds import Bounds, Positive, Seed, SideOrNone
-from rapid.config import (
-    AdaptConfig,
-    CollectConfig,
-    Config,
-    DistillConfig,
-    EvaluateConfig,
-    MixConfig,
-    NetworkConfig,
-    Plan,
-    Recipe,
-    Scale,
-    TeacherConfig,
-)
+from rapid.config import CollectConfig, Config, EvaluateConfig, MixConfig, Plan, Recipe, Scale, TeacherConfig
+from rapid.config_learning import AdaptConfig, DistillConfig, NetworkConfig
 from rapid.scenarios import Reward
 from rapid.tracking import Tracking
 

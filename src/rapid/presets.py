@@ -10,24 +10,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
-from rapid.config import (
-    PLANS,
-    RECIPES,
-    SCALES,
+from rapid.config import PLANS, RECIPES, SCALES, Config, MixConfig, Plan, Recipe, Scale
+from rapid.config_io import flat, to_dict
+from rapid.config_learning import (
     AdaptConfig,
     AdversaryConfig,
-    Config,
     DistillConfig,
     LossConfig,
-    MixConfig,
     NetworkConfig,
     OptimizerConfig,
-    Plan,
-    Recipe,
     RobustConfig,
-    Scale,
 )
-from rapid.config_io import flat, to_dict
 from rapid.errors import RapidError, did_you_mean
 from rapid.experiments.paper import paper_numbers
 

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import rapid
-from rapid.config import Config, PpoConfig, without_place
+from rapid.config import Config, without_place
 from rapid.config_io import apply_overrides, differences, to_dict, to_toml
+from rapid.config_learning import PpoConfig
 from rapid.errors import DamagedError, RapidError, did_you_mean
 from rapid.files import read_json, write_json, write_text
 from rapid.locks import is_empty

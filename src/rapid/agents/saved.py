@@ -16,8 +16,8 @@ from rapid import files
 from rapid.agents.shipped import agent_folder
 from rapid.agents.watchable import Watchable
 from rapid.bounds import numbers
-from rapid.config import NetworkConfig
 from rapid.config_io import apply_overrides
+from rapid.config_learning import NetworkConfig
 from rapid.errors import RapidError, sentence
 from rapid.networks.encoding import feature_scale
 from rapid.networks.memory import initial_state, next_state

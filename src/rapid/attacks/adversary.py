@@ -28,7 +28,7 @@ from rapid.attacks.draws import Source
 from rapid.attacks.search import Runs, Values
 from rapid.attacks.spec import AttackSpec
 from rapid.attacks.world import act_on
-from rapid.config import NetworkConfig
+from rapid.config_learning import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.scenarios import NUM_VEHICLES, get_scenario, seeing

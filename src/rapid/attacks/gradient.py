@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rapid.config import RobustConfig
+from rapid.config_learning import RobustConfig
 from rapid.networks.denormals import no_denormals
 
 ROUNDING = 1e-5

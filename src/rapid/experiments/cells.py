@@ -10,7 +10,8 @@ import json
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from rapid.config import AdaptConfig, DistillConfig, MixConfig, NetworkConfig, TeacherConfig
+from rapid.config import MixConfig, TeacherConfig
+from rapid.config_learning import AdaptConfig, DistillConfig, NetworkConfig
 from rapid.scenarios import Reward
 from rapid.spawns import SpawnSet
 

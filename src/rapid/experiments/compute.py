@@ -13,7 +13,8 @@ import torch
 import rapid
 from rapid.agents.open import open_agent
 from rapid.agents.saved import load_agent, remembers
-from rapid.config import Config, NetworkConfig
+from rapid.config import Config
+from rapid.config_learning import NetworkConfig
 from rapid.data.dataset import load_dataset, mix, save_dataset
 from rapid.data.relabel import relabel
 from rapid.errors import RapidError

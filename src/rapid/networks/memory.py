@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rapid.config import NetworkConfig
+from rapid.config_learning import NetworkConfig
 from rapid.scenarios import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER, TARGET_SPEEDS
 
 STEPS, SPEED_INDEX, SPEED, LEFTMOST, RIGHTMOST, DISTANCE = range(6)

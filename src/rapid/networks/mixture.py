@@ -10,7 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from rapid.config import NetworkConfig
+from rapid.config_learning import NetworkConfig
 from rapid.networks.blocks import Transformer
 from rapid.networks.encoding import num_inputs
 from rapid.networks.memory import Recalled

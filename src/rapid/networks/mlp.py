@@ -9,7 +9,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from rapid.config import NetworkConfig
+from rapid.config_learning import NetworkConfig
 from rapid.networks.encoding import num_inputs
 from rapid.scenarios import NUM_ACTIONS
 

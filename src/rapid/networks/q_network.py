@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from rapid.config import NetworkConfig
+from rapid.config_learning import NetworkConfig
 from rapid.data.batch import with_rows
 from rapid.errors import RapidError
 from rapid.networks.blocks import Transformer

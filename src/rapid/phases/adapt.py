@@ -5,8 +5,9 @@ from pathlib import Path
 
 from rapid.agents.open import check_road
 from rapid.agents.saved import QAgent, load_agent, save_agent
-from rapid.config import Config, NetworkConfig, without_place
+from rapid.config import Config, without_place
 from rapid.config_io import parts_of, to_dict
+from rapid.config_learning import NetworkConfig
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.networks.q_network import build_network, check_memory, for_lanes, widened, with_memory

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rapid.config import AdversaryConfig, PpoConfig
+from rapid.config_learning import AdversaryConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.seeding import numpy_stream, torch_stream
 from rapid.training.learner import check_generator

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rapid.config import LossConfig, OptimizerConfig
+from rapid.config_learning import LossConfig, OptimizerConfig
 from rapid.data.batch import TransitionBatch
 from rapid.errors import RapidError
 from rapid.losses import behavior_cloning_loss, q_loss

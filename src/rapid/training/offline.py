@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rapid import termination
-from rapid.config import DistillConfig, LossConfig, NetworkConfig
+from rapid.config_learning import DistillConfig, LossConfig, NetworkConfig
 from rapid.data.replay import OfflineSampler
 from rapid.data.transitions import TEACHER, Transitions
 from rapid.errors import RapidError

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rapid import termination
-from rapid.config import AdaptConfig, PpoConfig
+from rapid.config_learning import AdaptConfig, PpoConfig
 from rapid.data.replay import OfflineSampler, ReplayBuffer, join_batches
 from rapid.data.transitions import Transitions
 from rapid.errors import RapidError

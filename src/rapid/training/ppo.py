@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from rapid import termination
-from rapid.config import AdaptConfig, NetworkConfig, PpoConfig
 from rapid.config_io import least_steps
+from rapid.config_learning import AdaptConfig, NetworkConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
 from rapid.networks.blocks import compiled_attention

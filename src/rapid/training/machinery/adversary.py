@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rapid.config import AdversaryConfig
+from rapid.config_learning import AdversaryConfig
 from rapid.scenarios import NUM_ACTIONS
 
 CLEAN, NOISE, AWAY, TOWARDS = range(4)
