@@ -20,7 +20,8 @@ from rapid.networks.encoding import BESIDE, NEAR, NEAR_FEATURES
 from rapid.networks.memory import STATE_SIZE
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.mlp import MlpHead
-from rapid.networks.q_network import MIRRORED_ACTIONS, ActionDecoder, QNetwork, TokenHead
+from rapid.networks.q_network import MIRRORED_ACTIONS, QNetwork
+from rapid.networks.token_head import ActionDecoder, TokenHead
 from rapid.safety import filter_values, margins, read_box
 from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES
 

@@ -20,7 +20,8 @@ from rapid.networks.encoding import BESIDE, NEAR, Encoding
 from rapid.networks.memory import Memory
 from rapid.networks.mixture import MixtureOfPolicies, PolicyEncoder
 from rapid.networks.mlp import MlpHead
-from rapid.networks.q_network import MIRRORED_ACTIONS, QNetwork, TokenHead
+from rapid.networks.q_network import MIRRORED_ACTIONS, QNetwork
+from rapid.networks.token_head import TokenHead
 from rapid.scenarios import NUM_ACTIONS
 
 ROUNDING = 1e-4
