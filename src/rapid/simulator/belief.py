@@ -22,7 +22,8 @@ from rapid.scenarios import FEATURES, NUM_FEATURES, NUM_VEHICLES, Scenario, get_
 from rapid.simulator.compile import kernel
 from rapid.simulator.observation import INFO_COLUMNS, SIGHT
 from rapid.simulator.reconstruct import LATERAL_TIME, closeness, reconstruct
-from rapid.simulator.search import compiled_worlds, distinct, have_ended, select, tries_of
+from rapid.simulator.search import compiled_worlds, have_ended, tries_of
+from rapid.simulator.search_kernels import distinct, select
 from rapid.simulator.settings import Settings, read_settings
 from rapid.simulator.spawn import LANE_WIDTH, TRAFFIC_START_SPEED, nearest_speed_index
 from rapid.simulator.state import (

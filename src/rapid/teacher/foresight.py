@@ -22,7 +22,7 @@ from rapid.simulator.compile import kernel
 from rapid.simulator.configuration import merge_config
 from rapid.simulator.observation import INFO_COLUMNS
 from rapid.simulator.reconstruct import BRAKING, GAP_TIME, STANDSTILL_GAP, closeness, reconstruct
-from rapid.simulator.search import distinct, select
+from rapid.simulator.search_kernels import distinct, select
 from rapid.simulator.settings import Settings, read_settings
 from rapid.simulator.spawn import nearest_speed_index
 from rapid.simulator.state import CAR_ROWS, RANK, SPEED, TAG_ROWS, TARGET_LANE, WORLD_ENTRIES, X
