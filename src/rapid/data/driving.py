@@ -5,82 +5,35 @@ import sys
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from rapid.data.budget import Budget, SpentError, Tally
 from rapid.data.dataset import Dataset
 from rapid.data.fallbacks import TooManyFallbacksError, check_share, is_fallback
 from rapid.data.hindsight import Hindsight
 from rapid.data.journal import Journal
 from rapid.data.parts import Parts
 from rapid.data.tables import LOG_SCHEMA, PART_SCHEMA, TRANSITION_SCHEMA, from_table, to_table
-from rapid.data.transitions import SOURCES, TEACHER, Transitions
+from rapid.data.transitions import SOURCES, Transitions
 from rapid.data.unwritten import UNWRITTEN_FILE, Cost, Unwritten
 from rapid.errors import RapidError
 from rapid.progress import Task
 from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
 from rapid.seeding import stream_seed
-from rapid.teacher.decision import (
-    Decision,
-    InterruptedDecisions,
-    Teacher,
-    Timed,
-    UnfinishedError,
-    UnreachableError,
-)
+from rapid.teacher.decision import Decision, InterruptedDecisions, Teacher, Timed, UnfinishedError, UnreachableError
 from rapid.teacher.experience import MEMORY_FILE, Experience
 from rapid.teacher.patience import StoppedError
 from rapid.termination import StoppedError as TerminatedError
 
 MakeWorlds = Callable[[int], Any]
 """Gives a vector environment of so many worlds, in which a finished world waits for the others."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """When to stop early; 0 is no limit. All but seconds count over all runs of a collection, seconds over this one."""
-
-    tokens: int = 0
-    """Tokens read and written."""
-    cost: float = 0.0
-    """Price, in the currency of the settings."""
-    seconds: float = 0.0
-    """Wall-clock seconds of this process."""
-    decisions: int = 0
-    """Decisions; never exceeded, while the others are noticed once they are."""
-    fallback_share: float = 1.0
-    """Share of decisions that a rule may make in the model's place; above it, collecting fails."""
-
-
-class Tally(NamedTuple):
-    """How far a collection is, sent after every step."""
-
-    decisions: int = 0
-    """Decisions so far, those of earlier runs included."""
-    fresh: int = 0
-    """Decisions that the teacher was asked for in this run."""
-    rate: float = 0.0
-    """Fresh decisions per second."""
-    cost: float = 0.0
-    fallbacks: int = 0
-
-    def note(self, source: int) -> str:
-        """Return what is shown beside the count; chance gives no invalid answers."""
-        cost = f", cost {self.cost:.4g}" if self.cost else ""
-        invalid = f", {self.fallbacks / max(self.decisions, 1):.1%} fallbacks" if source == TEACHER else ""
-        return f"{self.rate:.3g} decisions/s{cost}{invalid}"
-
-
 JOURNAL_FILE = "journal.jsonl"
-
-
-class SpentError(RapidError):
-    """The budget is spent; the message says which."""
 
 
 class Collecting:
@@ -351,16 +304,8 @@ class Collecting:
 
     def _check_budget(self, coming: int) -> None:
         """Raise if the budget is spent, or does not allow for the decisions that come next."""
-        budget, seconds = self.budget, time.monotonic() - self.start
-        if budget.decisions and self.decisions + coming > budget.decisions:
-            raise SpentError(f"The budget of {budget.decisions} decisions was spent")
-        for name, used, limit in (
-            ("tokens", self.tokens, budget.tokens),
-            ("cost", self.cost, budget.cost),
-            ("seconds", seconds, budget.seconds),
-        ):
-            if limit and used >= limit:
-                raise SpentError(f"The budget of {limit:g} {name} was spent")
+        seconds = time.monotonic() - self.start
+        self.budget.check(self.decisions + coming, self.tokens, self.cost, seconds)
 
     def _show(self, count: int) -> None:
         rate = self.fresh / max(time.monotonic() - self.start, 1e-9)

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from rapid.data.budget import Budget, SpentError, Tally
 from rapid.data.collection import collect, identity
 from rapid.data.dataset import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE, Dataset, join, load_dataset, save_dataset
-from rapid.data.driving import Budget, MakeWorlds, SpentError, Tally
+from rapid.data.driving import MakeWorlds
 from rapid.data.journal import check_settings, check_unclaimed
 from rapid.data.transitions import SOURCES, concatenate
 from rapid.engines import Engine, Report, check_engine, run_jobs
