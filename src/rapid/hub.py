@@ -21,7 +21,8 @@ import torch
 from rapid import files
 from rapid.agents import card as agent_card
 from rapid.agents.onnx import TOLERANCE, OnnxAgent
-from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, QAgent, load_agent
+from rapid.agents.q_agent import QAgent
+from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent
 from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, is_shipped
 from rapid.data.batch import with_rows
 from rapid.data.card import card as dataset_card

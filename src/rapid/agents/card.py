@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from rapid.agents.saved import QAgent
+from rapid.agents.q_agent import QAgent
 from rapid.text import in_markdown
 
 

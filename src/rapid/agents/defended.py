@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rapid.agents.open import kind_of
-from rapid.agents.saved import check_observations, noticed, remembers
+from rapid.agents.q_agent import check_observations
+from rapid.agents.saved import noticed, remembers
 from rapid.attacks.attack import network_of
 from rapid.defences import DefendedNetwork, make_defence
 from rapid.errors import RapidError

@@ -16,7 +16,8 @@ import numpy as np
 
 from rapid import files
 from rapid.agents.onnx_graph import build_model
-from rapid.agents.saved import NAME_LENGTH, QAgent, check_observations
+from rapid.agents.q_agent import QAgent, check_observations
+from rapid.agents.saved import NAME_LENGTH
 from rapid.agents.watchable import Watchable
 from rapid.errors import RapidError, how_to_install, sentence
 from rapid.networks.memory import initial_state, next_state

@@ -20,7 +20,7 @@ from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision
 
 if TYPE_CHECKING:
-    from rapid.agents.saved import QAgent
+    from rapid.agents.q_agent import QAgent
 
 PLANNERS = ("planner", "planner-cars", "planner-observation")
 """Searches in the simulator: with perfect knowledge, of all cars but not of their drivers, and of what is observed."""

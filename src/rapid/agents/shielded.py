@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.agents.open import kind_of
-from rapid.agents.saved import QAgent
+from rapid.agents.q_agent import QAgent
 from rapid.agents.watchable import Watchable
 from rapid.evaluation.metrics import Kind
 from rapid.safety import IntervalFilter

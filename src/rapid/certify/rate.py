@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rapid.agents.saved import QAgent, moved_on, remembers
+from rapid.agents.q_agent import QAgent
+from rapid.agents.saved import moved_on, remembers
 from rapid.certify.bounds import ROUNDING, Bounds
 from rapid.data.batch import with_rows
 from rapid.errors import RapidError

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from rapid import files
-from rapid.agents.saved import QAgent
+from rapid.agents.q_agent import QAgent
 from rapid.certify.rate import CertifiedReturn, DecisionRates, Reach, certified_return, check_reward, decision_rates
 from rapid.errors import RapidError
 from rapid.evaluation.statistics import Estimate

@@ -4,7 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from rapid.agents.open import check_road
-from rapid.agents.saved import QAgent, load_agent, save_agent
+from rapid.agents.q_agent import QAgent
+from rapid.agents.saved import load_agent, save_agent
 from rapid.config import Config, without_place
 from rapid.config_io import parts_of, to_dict
 from rapid.config_learning import NetworkConfig

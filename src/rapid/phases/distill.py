@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rapid.agents.saved import QAgent, save_agent
+from rapid.agents.q_agent import QAgent
+from rapid.agents.saved import save_agent
 from rapid.config import Config, without_place
 from rapid.config_io import parts_of, to_dict
 from rapid.data.dataset import Dataset, load_dataset

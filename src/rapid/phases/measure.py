@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from rapid.agents.open import PLANNERS, check_road, open_agent
-from rapid.agents.saved import QAgent
+from rapid.agents.q_agent import QAgent
 from rapid.attacks import get_attack
 from rapid.attacks.adversary import fingerprint, save_adversary, train_adversary
 from rapid.attacks.attack import offers
