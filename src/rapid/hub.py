@@ -26,7 +26,8 @@ from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent
 from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, is_shipped
 from rapid.data.batch import with_rows
 from rapid.data.card import card as dataset_card
-from rapid.data.dataset import DATASET_FILE, LICENCE, LOG_FILE, TRANSITIONS_FILE, load_dataset
+from rapid.data.dataset import LICENCE, load_dataset
+from rapid.data.dataset_files import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE
 from rapid.data.shipped import dataset_folder, shipped_sets
 from rapid.errors import RapidError, how_to_install, sentence
 from rapid.progress import task

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from rapid.data.budget import Budget, SpentError, Tally
-from rapid.data.dataset import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE, Dataset, load_dataset, save_dataset
+from rapid.data.dataset import Dataset, load_dataset, save_dataset
+from rapid.data.dataset_files import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE
 from rapid.data.driving import JOURNAL_FILE, Collecting, MakeWorlds
 from rapid.data.journal import check_settings, check_unclaimed
 from rapid.data.parts import LIST_FILE

@@ -5,11 +5,20 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from rapid.data.dataset_files import (
+    DATASET_FILE,
+    LOG_FILE,
+    SCHEMA_VERSION,
+    TRANSITIONS_FILE,
+    MixLevel,
+    check_files,
+    check_kinds,
+)
 from rapid.data.shipped import dataset_folder
 from rapid.data.tables import current_log, from_table, read_parquet, to_table, write_parquet
 from rapid.data.transitions import RANDOM, SOURCES, TEACHER, Transitions, concatenate
@@ -19,11 +28,7 @@ from rapid.scenarios import ACTIONS, get_scenario
 from rapid.seeding import numpy_stream
 from rapid.teacher.experience import MEMORY_FILE, Experience, read_experiences, to_lines
 
-SCHEMA_VERSION = 1
-DATASET_FILE, TRANSITIONS_FILE, LOG_FILE = "dataset.json", "transitions.parquet", "teacher_log.parquet"
 LICENCE = "Apache-2.0"
-
-MixLevel = Literal["transition", "batch"]
 
 
 @dataclass(frozen=True)
@@ -135,7 +140,7 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
         )
     try:
         get_scenario(meta["scenario"])
-        _check_files(root, meta["files"])
+        check_files(root, meta["files"])
         table = read_parquet(root / TRANSITIONS_FILE, "transitions")
         log = current_log(read_parquet(root / LOG_FILE, "teacher log")) if LOG_FILE in meta["files"] else None
         memory = read_experiences(root / MEMORY_FILE) if MEMORY_FILE in meta["files"] else None
@@ -157,46 +162,6 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
             "of one collection; copy or make it again."
         )
     return dataset
-
-
-def check_kinds(meta: dict[str, Any]) -> None:
-    """Raise TypeError or ValueError unless what ``dataset.json`` says has the form that its readers expect."""
-    for name in ("mixture", "collection"):
-        if meta[name] is not None and not isinstance(meta[name], dict):
-            raise TypeError(f"'{name}' is {meta[name]!r}")
-    if not all(isinstance(driver, dict) for driver in meta["drivers"].values()):
-        raise TypeError("'drivers' does not describe each driver")
-    mixture: dict[str, Any] = meta["mixture"] or {"p": 0, "level": "transition"}
-    if not 0 <= mixture["p"] <= 1 or mixture["level"] not in get_args(MixLevel):
-        raise ValueError(f"'mixture' has the share {mixture['p']!r} and the level {mixture['level']!r}")
-
-
-def _check_files(root: Path, listed: dict[str, Any]) -> None:
-    """Raise unless every file of the dataset is named with its size and hash, and has them."""
-    unnamed = [name for name in (LOG_FILE, MEMORY_FILE) if name not in listed and (root / name).exists()]
-    for name in (TRANSITIONS_FILE, *unnamed):
-        if name not in listed:
-            raise RapidError(
-                f"'{root / DATASET_FILE}' does not name the SHA-256 of '{name}', so nobody can tell whether that is "
-                "the file that was written. Copy the dataset again, as a whole."
-            )
-    for name, facts in listed.items():
-        if name not in (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE):
-            raise RapidError(f"'{root / DATASET_FILE}' names a file '{name}', which no dataset has. Copy it again.")
-        _check_file(root / name, facts)
-
-
-def _check_file(path: Path, facts: dict[str, Any]) -> None:
-    """Raise unless the file has the size and hash that were recorded."""
-    if not path.is_file():
-        raise RapidError(f"The dataset lacks its file '{path}'. Copy it there, or make the dataset again.")
-    size = path.stat().st_size
-    if size != facts["bytes"]:
-        raise RapidError(
-            f"'{path}' has {size} bytes, expected {facts['bytes']}: it was cut off. Copy or make it again."
-        )
-    if sha256(path) != facts["sha256"]:
-        raise RapidError(f"'{path}' is not the file that was written (its SHA-256 differs). Copy or make it again.")
 
 
 def episode_returns(transitions: Transitions) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,8 @@ import gymnasium
 import numpy as np
 
 from rapid.data.card import card
-from rapid.data.dataset import LICENCE, SCHEMA_VERSION, Dataset, check_kinds
+from rapid.data.dataset import LICENCE, Dataset
+from rapid.data.dataset_files import SCHEMA_VERSION, check_kinds
 from rapid.data.transitions import Transitions, concatenate
 from rapid.errors import RapidError, how_to_install, sentence
 from rapid.files import atomic_path

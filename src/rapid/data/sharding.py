@@ -19,7 +19,8 @@ import pyarrow as pa
 
 from rapid.data.budget import Budget, SpentError, Tally
 from rapid.data.collection import collect, identity
-from rapid.data.dataset import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE, Dataset, join, load_dataset, save_dataset
+from rapid.data.dataset import Dataset, join, load_dataset, save_dataset
+from rapid.data.dataset_files import DATASET_FILE, LOG_FILE, TRANSITIONS_FILE
 from rapid.data.driving import MakeWorlds
 from rapid.data.journal import check_settings, check_unclaimed
 from rapid.data.transitions import SOURCES, concatenate
