@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rapid import files
-from rapid.agents.onnx_graph import build_model
+from rapid.agents.onnx_network import build_model
 from rapid.agents.q_agent import QAgent, check_observations
 from rapid.agents.saved import NAME_LENGTH
 from rapid.agents.watchable import Watchable
