@@ -1,3 +1,4 @@
+import multiprocessing
 import os
 import signal
 import sys
@@ -41,8 +42,16 @@ def test_processes_do_the_same():
     results, heard, pids = run([1, 2, 3], workers=2)
     assert results == {0: 1, 1: 4, 2: 9}
     assert sorted(heard) == [(0, ("begun", 1)), (1, ("begun", 2)), (2, ("begun", 3))]
-    assert len(pids) == 3
+    assert 1 <= len(pids) <= 2, "a process takes the next job when it is free"
     assert os.getpid() not in pids
+    assert not multiprocessing.active_children()
+
+
+def test_a_lost_process_is_replaced():
+    results = dict(run_jobs(job, [-2, 2, -2, 3, 4], workers=2, lost=lambda index, why: (f"job {index}: {why}", 0)))
+    assert [results[index][0] for index in (1, 3, 4)] == [4, 9, 16]
+    assert all(f"job {index}: its process was ended from outside" in results[index][0] for index in (0, 2))
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize(

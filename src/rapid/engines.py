@@ -4,6 +4,7 @@ A job is a function of one argument and of `report`, which sends anything back w
 must be picklable. What a job returns does not depend on where it ran.
 """
 
+import contextlib
 import importlib
 import multiprocessing
 import os
@@ -120,23 +121,29 @@ def _in_processes(
     # Not an executor of the standard library: those cannot be told to end their processes.
     context = multiprocessing.get_context("spawn")
     running: dict[Connection, tuple[int, Any]] = {}
+    free: list[tuple[Connection, Any]] = []
     try:
         while waiting.fill() or running:
             while len(running) < workers and waiting.fill():
                 index, argument = waiting.pop()
-                ours, theirs = context.Pipe(duplex=False)
-                process = context.Process(target=_serve, args=(theirs, function, argument), daemon=True)
-                with termination.deaf_children():
-                    process.start()
-                    # Only the process holds the other end, so that its death shows as the end of the pipe.
-                    theirs.close()
-                    running[ours] = index, process
+                if not free:
+                    ours, theirs = context.Pipe()
+                    process = context.Process(target=_serve, args=(theirs, function), daemon=True)
+                    with termination.deaf_children():
+                        process.start()
+                        # Only the process holds the other end, so that its death shows as the end of the pipe.
+                        theirs.close()
+                        free.append((ours, process))
+                connection, process = free.pop()
+                running[connection] = index, process
+                with contextlib.suppress(OSError):  # one that has ended shows as the end of the pipe
+                    connection.send(argument)
             for connection in wait(list(running)):
                 assert isinstance(connection, Connection)
                 index, process = running[connection]
                 try:
                     kind, value = connection.recv()
-                except EOFError:
+                except (EOFError, OSError):
                     process.join(_PATIENCE)
                     why = _ended(process.exitcode)
                     if lost is not None:
@@ -152,14 +159,15 @@ def _in_processes(
                     receive(index, value)
                     continue
                 del running[connection]
-                connection.close()
-                process.join(_PATIENCE)
+                free.append((connection, process))  # the next job spares its start, which takes seconds
                 yield index, _unpack(kind, value)
     finally:
         for connection, (_, process) in running.items():
             process.terminate()
             connection.close()
-        for _, process in running.values():
+        for connection, _ in free:
+            connection.close()
+        for process in (process for _, process in (*running.values(), *free)):
             process.join(_PATIENCE)
 
 
@@ -170,8 +178,11 @@ def _ended(exit_code: int | None) -> str:
     return f"ended by itself (exit code {exit_code}); what it printed above says why"
 
 
-def _serve(connection: Connection, function: Callable[[Any, Report], Any], argument: Any) -> None:
-    """Do one job in a process of its own; it ends with the parent, which it notices when it next reports."""
+def _serve(connection: Connection, function: Callable[[Any, Report], Any]) -> None:
+    """Do one job after another in a process of its own.
+
+    It ends when the parent closes the connection, or ends: that it notices when it next reports.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
 
     def send(message: tuple[str, Any]) -> None:
@@ -180,7 +191,10 @@ def _serve(connection: Connection, function: Callable[[Any, Report], Any], argum
         except OSError:  # nobody listens any more
             raise SystemExit(1) from None
 
-    send(_attempt(rapid.__version__, function, argument, lambda value: send(("report", value))))
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            argument = connection.recv()
+            send(_attempt(rapid.__version__, function, argument, lambda value: send(("report", value))))
 
 
 def _attempt(version: str, function: Callable[[Any, Report], Any], argument: Any, report: Report) -> tuple[str, Any]:
