@@ -41,6 +41,14 @@ def driver(server, **changes) -> ConversingTeacher:
     return ConversingTeacher(Endpoint(config, first_wait=0.01), config, {"model": "m"}, 3)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compiled(tmp_path_factory):
+    """Kernels are compiled where no clock runs."""
+    server = Server()
+    collect(driver(server), "lane-3-density-2-fast", tmp_path_factory.mktemp("compiled"), 30, 4)
+    server.close()
+
+
 class Slow:
     """Answers the first requests at once and every later one after so many seconds, or when it is let go."""
 
