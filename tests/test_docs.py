@@ -115,3 +115,12 @@ def test_every_test_that_the_page_of_faults_names_exists():
         or not re.search(rf"^def {name}\(", (ROOT / "tests" / path).read_text(encoding="utf-8"), flags=re.M)
     ]
     assert missing == []
+
+
+def test_the_table_of_the_architecture_has_every_module_and_nothing_else():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Conventions")[0]
+    cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    named = {name.rstrip("/") for cell in cells for name in re.findall("`([^`]+)`", cell)}
+    package = ROOT / "src" / "rapid"
+    there = {path.stem for path in package.glob("[!_]*.py")} | {path.parent.name for path in package.glob("*/*.py")}
+    assert named == there | {"shipped"}
