@@ -5,20 +5,21 @@ be exported, its ONNX file.
 
     python benchmarks/ship_agents.py runs/adapted/agent rapid "Best clean return: 300,000 steps, then 700,000 by PPO"
 
-An adversary is measured on its victim, and goes to ``src/rapid/shipped/SCENARIO/adversaries/NAME``.
+What cards say beside the scores is written anew from committed rows by ``--cards``. An adversary is measured on its victim, and goes to ``src/rapid/shipped/SCENARIO/adversaries/NAME``.
 
     python benchmarks/ship_agents.py runs/adversary adversary "..." --victim shipped:lane-3-density-2/robust
 """
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rapid.agents.onnx import driven_observations, export_onnx
 from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent
-from rapid.agents.shipped import CARD_FILE, ONNX_FILE
+from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, shipped_agents
+from rapid.attacks.spec import parse_attack
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
 from rapid.evaluation.rollouts import evaluate_agent
@@ -26,11 +27,38 @@ from rapid.evaluation.statistics import estimate
 from rapid.files import read_json, sha256, write_bytes, write_json
 from rapid.progress import task
 from rapid.runs import commit
+from rapid.scenarios import get_scenario
 from rapid.spawns import spawn_seeds
 
 ATTACKS = ("none", "uniform", "gaussian", "fgsm", "pgd")
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "rapid" / "shipped"
 SIZES = "Attacks are the paper's: noise of 0.2, gradients of 0.1 in normalised features (20 m along the road)."
+FLOORS = ("slower", "immune", "blind")
+FLOOR_ROWS = Path(__file__).resolve().parents[1] / "results" / "cells" / "floors-full.parquet"
+
+
+class Made(NamedTuple):
+    """How the agents of a name were made."""
+
+    label: str
+    """What tables call one."""
+    recipe: str
+    data: str
+
+
+_MIXED = "{} teacher and random, 15,000 transitions of each"
+_HOME = "shipped:lane-3-density-2"
+MADE = {
+    "distilled": Made("RAPID, distilled", "strong, phase 2", _MIXED),
+    "rapid-10k": Made("RAPID, 10K online", "strong, plan careful", _MIXED + "; 10,000 online steps"),
+    "rapid": Made("RAPID, 300K + 700K PPO", "strong, plan ppo", _MIXED + "; 1,000,000 online steps"),
+    "mlp": Made("MLP, 300K + 700K PPO", "strong, plan ppo, from new weights", "1,000,000 online steps"),
+    "robust": Made(
+        "RAPID, robust",
+        "strong, plan robust",
+        _MIXED.format(_HOME) + "; 600,000 online steps under attack in lane-3-density-2",
+    ),
+}
 LIMITS = (
     "It drives HighwayEnv's straight highway in the scenario named, and nothing else. It is no driver of real cars. "
     "Stronger attacks than those measured may fool it."
@@ -53,6 +81,29 @@ def _score(rows: list[EpisodeRow], attack: str) -> dict[str, Any]:
         "crash_share": round(float(np.mean(column(here, "crashed"))), 3),
         "episodes": len(here),
     }
+
+
+def made(scenario: str, name: str) -> dict[str, Any]:
+    """Return how an agent was made, and the floors and attacks of its scenario."""
+    how, rows = MADE[name], load_rows(FLOOR_ROWS)
+    lanes = get_scenario(scenario).lanes
+    here = {agent: [row for row in rows if (row.scenario, row.agent) == (scenario, agent)] for agent in FLOORS}
+    return {
+        "recipe": how.recipe,
+        "data": how.data.format(f"shipped:{scenario}"),
+        "floors": {agent: _score(found, "none") for agent, found in here.items()},
+        "attacks": {attack: parse_attack(attack).describe(lanes) for attack in ATTACKS if attack != "none"},
+    }
+
+
+def renew_cards() -> None:
+    """Write anew what cards say beside the scores, from what is committed."""
+    for name in shipped_agents():
+        home = agent_folder(f"shipped:{name}")
+        config = read_json(home / CONFIG_FILE, "agent")
+        config["metadata"]["name"] = MADE[home.name].label
+        write_json(home / CONFIG_FILE, config)
+        write_json(home / CARD_FILE, read_json(home / CARD_FILE, "card") | made(name.partition("/")[0], home.name))
 
 
 def ship_adversary(folder: Path, metadata: dict[str, Any], name: str, summary: str, victim: str, spawns: int) -> None:
@@ -89,14 +140,20 @@ def ship_adversary(folder: Path, metadata: dict[str, Any], name: str, summary: s
 def main() -> None:
     """Measure one agent and write its directory."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("agent", type=Path, help="directory of the trained agent")
-    parser.add_argument("name", help="its name in the package")
-    parser.add_argument("summary", help="one sentence: what it is")
+    parser.add_argument("agent", type=Path, nargs="?", help="directory of the trained agent")
+    parser.add_argument("name", nargs="?", choices=(*MADE, "adversary"), help="its name in the package")
+    parser.add_argument("summary", nargs="?", default="", help="one sentence: what it is")
+    parser.add_argument("--cards", action="store_true", help="only write the cards of all that are shipped anew")
     parser.add_argument("--scenario", default="", help="by default the one that it was trained in")
     parser.add_argument("--spawns", type=int, default=200, help="test spawns")
     parser.add_argument("--work", type=Path, default=Path("runs/ship"), help="where the rows are kept")
     parser.add_argument("--victim", default="", help="the agent that an adversary was trained against")
     chosen = parser.parse_args()
+    if chosen.cards:
+        renew_cards()
+        return
+    if chosen.agent is None or chosen.name is None:
+        parser.error("give the directory of an agent and its name, or --cards")
     agent = load_agent(chosen.agent)
     if chosen.victim:
         ship_adversary(chosen.agent, agent.metadata, chosen.name, chosen.summary, chosen.victim, chosen.spawns)
@@ -128,6 +185,7 @@ def main() -> None:
     for name in ("from", "data"):  # where they lay on this machine is nobody's business
         if name in config["metadata"]:
             config["metadata"][name] = Path(config["metadata"][name]).name
+    config["metadata"]["name"] = MADE[chosen.name].label
     write_json(home / CONFIG_FILE, config)
     shipped = load_agent(home)
     try:
@@ -145,6 +203,7 @@ def main() -> None:
             "phase": agent.metadata.get("phase"),
             "scores": scores(rows),
             "scores_are": f"One training over {chosen.spawns} test spawns. {SIZES}",
+            **made(scenario, chosen.name),
             "weights_sha256": read_json(home / CONFIG_FILE, "agent")["weights_sha256"],
             "onnx": onnx,
             "commit": commit(),

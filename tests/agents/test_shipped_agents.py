@@ -11,13 +11,16 @@ from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, card, listi
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import evaluate_agent, run_episodes
 from rapid.files import sha256
+from rapid.scenarios import PAPER_SCENARIOS
 from rapid.spawns import spawn_seeds
 
 NAMES = shipped_agents()
 
 
 def test_there_are_some():
-    assert "lane-3-density-2/robust" in NAMES
+    drivers = ("distilled", "mlp", "rapid", "rapid-10k", "robust")
+    assert NAMES == tuple(f"{scenario}/{name}" for scenario in PAPER_SCENARIOS for name in drivers)
+    assert shipped_adversaries() == tuple(f"{scenario}/adversary" for scenario in PAPER_SCENARIOS)
     assert sum(path.stat().st_size for name in NAMES for path in agent_folder(f"shipped:{name}").iterdir()) < 10e6
 
 
@@ -28,7 +31,10 @@ def test_a_shipped_agent_is_what_its_card_says(name: str):
     assert about["scenario"] == name.partition("/")[0]
     assert about["weights_sha256"] == sha256(folder / "weights.safetensors")
     assert {"none", "uniform", "gaussian", "fgsm", "pgd", "worst"} <= about["scores"].keys()
-    assert about["limits"]
+    assert about["floors"].keys() == {"slower", "immune", "blind"}
+    assert about["attacks"].keys() == {"uniform", "gaussian", "fgsm", "pgd"}
+    assert all(about[said] for said in ("summary", "recipe", "data", "scores_are", "commit", "limits"))
+    assert about["scores"]["none"]["interval"][0] <= about["scores"]["none"]["return"]
     for path in (folder / CARD_FILE, folder / "config.json"):
         # Nothing of the machine on which it was made.
         assert not any(word in path.read_text() for word in ("/home/", "/work/", "/tmp/", "/root/"))
