@@ -5,7 +5,8 @@ be exported, its ONNX file.
 
     python benchmarks/ship_agents.py runs/adapted/agent rapid "Best clean return: 300,000 steps, then 700,000 by PPO"
 
-What cards say beside the scores is written anew from committed rows by ``--cards``. An adversary is measured on its victim, and goes to ``src/rapid/shipped/SCENARIO/adversaries/NAME``.
+An adversary is measured on its victim, and goes to ``src/rapid/shipped/SCENARIO/adversaries/NAME``.
+What cards say beside the scores is written anew from committed rows by ``--cards``.
 
     python benchmarks/ship_agents.py runs/adversary adversary "..." --victim shipped:lane-3-density-2/robust
 """
