@@ -23,13 +23,13 @@ from rapid.config import Config
 from rapid.data.dataset import Dataset, load_dataset, mix
 from rapid.data.replay import OfflineSampler
 from rapid.files import write_json, write_text
+from rapid.networks.denormals import no_denormals
 from rapid.networks.q_network import build_network, set_phase
 from rapid.presets import preset
 from rapid.progress import task
 from rapid.runs import commit
 from rapid.scenarios import get_scenario
 from rapid.training.learner import Learner
-from rapid.training.machinery.adam import flush_denormals
 from simulator import processor, shown
 
 WAYS = ("cpu", "cuda, step by step", "cuda, recorded")
@@ -64,7 +64,7 @@ def learner_of(config: Config, phase: str, way: str, lanes: int) -> Learner:
     return learner
 
 
-@flush_denormals()
+@no_denormals()
 def measure(dataset: Dataset, sizes: list[int], rounds: int) -> list[dict[str, Any]]:
     """Return the milliseconds of one update by kind, batch size, way and round."""
     lanes = get_scenario(dataset.scenario).lanes

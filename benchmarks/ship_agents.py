@@ -19,7 +19,7 @@ import numpy as np
 
 from rapid.agents.onnx import driven_observations, export_onnx
 from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent
-from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, shipped_agents
+from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, shipped_adversaries, shipped_agents
 from rapid.attacks.spec import parse_attack
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, column, load_rows, save_rows
@@ -101,10 +101,27 @@ def renew_cards() -> None:
     """Write anew what cards say beside the scores, from what is committed."""
     for name in shipped_agents():
         home = agent_folder(f"shipped:{name}")
-        config = read_json(home / CONFIG_FILE, "agent")
+        config, scenario = read_json(home / CONFIG_FILE, "agent"), name.partition("/")[0]
         config["metadata"]["name"] = MADE[home.name].label
         write_json(home / CONFIG_FILE, config)
-        write_json(home / CARD_FILE, read_json(home / CARD_FILE, "card") | made(name.partition("/")[0], home.name))
+        about = made(scenario, home.name) | {"onnx": exported(home, scenario)}
+        write_json(home / CARD_FILE, read_json(home / CARD_FILE, "card") | about)
+    for name in shipped_adversaries():
+        home = agent_folder(f"shipped:{name}")
+        config, about = read_json(home / CONFIG_FILE, "agent"), read_json(home / CARD_FILE, "card")
+        config["metadata"]["name"] = f"adversary of {load_agent(about['victim']).name}"
+        write_json(home / CONFIG_FILE, config)
+
+
+def exported(home: Path, scenario: str) -> dict[str, Any] | str:
+    """Write an agent's ONNX file, and return its hash and how far it is from the agent, or why there is none."""
+    agent = load_agent(home)
+    try:
+        seen = driven_observations(agent, scenario, spawn_seeds("test", 4))
+        parity = export_onnx(agent, home / ONNX_FILE, *seen)
+    except RapidError as error:
+        return str(error)
+    return {"sha256": sha256(home / ONNX_FILE), "largest_difference": float(f"{parity.difference:.2g}")}
 
 
 def ship_adversary(folder: Path, metadata: dict[str, Any], name: str, summary: str, victim: str, spawns: int) -> None:
@@ -153,8 +170,10 @@ def main() -> None:
     if chosen.cards:
         renew_cards()
         return
-    if chosen.agent is None or chosen.name is None:
-        parser.error("give the directory of an agent and its name, or --cards")
+    if chosen.agent is None or chosen.name is None or not chosen.summary:
+        parser.error("give the directory of an agent, its name and what it is, or --cards")
+    if (chosen.name == "adversary") != bool(chosen.victim):
+        parser.error("an adversary has a --victim, and nothing else has")
     agent = load_agent(chosen.agent)
     if chosen.victim:
         ship_adversary(chosen.agent, agent.metadata, chosen.name, chosen.summary, chosen.victim, chosen.spawns)
@@ -188,12 +207,6 @@ def main() -> None:
             config["metadata"][name] = Path(config["metadata"][name]).name
     config["metadata"]["name"] = MADE[chosen.name].label
     write_json(home / CONFIG_FILE, config)
-    shipped = load_agent(home)
-    try:
-        parity = export_onnx(shipped, home / ONNX_FILE, *driven_observations(shipped, scenario, seeds[:4]))
-        onnx: Any = {"sha256": sha256(home / ONNX_FILE), "largest_difference": float(f"{parity.difference:.2g}")}
-    except RapidError as error:
-        onnx = str(error)
     write_json(
         home / CARD_FILE,
         {
@@ -206,7 +219,7 @@ def main() -> None:
             "scores_are": f"One training over {chosen.spawns} test spawns. {SIZES}",
             **made(scenario, chosen.name),
             "weights_sha256": read_json(home / CONFIG_FILE, "agent")["weights_sha256"],
-            "onnx": onnx,
+            "onnx": exported(home, scenario),
             "commit": commit(),
             "licence": "Apache-2.0",
             "limits": LIMITS,

@@ -1,3 +1,4 @@
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -52,6 +53,16 @@ def test_a_lost_process_is_replaced():
     assert [results[index][0] for index in (1, 3, 4)] == [4, 9, 16]
     assert all(f"job {index}: its process was ended from outside" in results[index][0] for index in (0, 2))
     assert not multiprocessing.active_children()
+
+
+def test_the_end_of_a_process_that_had_nothing_to_do_is_no_jobs_end():
+    given = iter([[2], [3]])
+    results: dict[int, int] = {}
+    for index, (value, pid) in run_jobs(job, [1], workers=2, more=lambda: next(given, [])):
+        results[index] = value
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    assert results == {0: 1, 1: 4, 2: 9}
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,7 @@ def test_a_training_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path: Path)
         (("evaluate", "agent", "--out", "x"), "; what is done is kept. The same command goes on."),
         (("evaluate", "agent", "--out=x"), "; what is done is kept. The same command goes on."),
         (("evaluate", "agent"), "."),
+        (("adversary", "agent"), "."),
         (("play",), "."),
         (("doctor",), "."),
     ],

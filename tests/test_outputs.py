@@ -156,9 +156,22 @@ def test_collect_without_a_place_goes_beside_what_was_collected_with_other_setti
         (beside,) = {path.name for path in Path("data").iterdir()} - {"teacher", "random"}
         assert beside.startswith("teacher-")
         assert f"30 transitions in data/{beside}" in capsys.readouterr().out
+    other = Path("data") / beside
+    assert not list(Path("data").glob("*/collecting")), "nothing is left in what is another's"
+    # It stays there, also with workers and once the usual place is free.
+    assert run(*COLLECT[:driver], "idle", *COLLECT[driver + 1 :], "--workers", "2") == 2
+    assert f"The collection in '{other}' was begun in one part" in capsys.readouterr().err
+    Path("data/teacher").rename("away")
+    assert run(*COLLECT[:driver], "idle", *COLLECT[driver + 1 :]) == 0
+    assert f"30 transitions in {other}" in capsys.readouterr().out
+    Path("away").rename("data/teacher")
+    assert run(*COLLECT[:driver], "faster", *COLLECT[driver + 1 :], "--workers", "2") == 0
+    said = capsys.readouterr()
+    assert "'data/teacher' is of another request (driver.name: 'slower' there, 'faster' now" in said.err
+    assert len(list(Path("data").iterdir())) == 4
     # A place that is named is the user's choice: nothing goes elsewhere.
     assert run(*COLLECT[:driver], "faster", *COLLECT[driver + 1 :], "--out", "data/teacher") == 2
-    assert len(list(Path("data").iterdir())) == 3
+    assert len(list(Path("data").iterdir())) == 4
     assert {name: held for name, held in contents(tmp_path).items() if name.startswith("data/teacher/")} == first
 
 

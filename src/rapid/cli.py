@@ -118,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     raise SystemExit(code)
 
 
-_GO_ON = ("run", "collect", "distill", "adapt", "adversary", "evaluate", "teach-bench", "reproduce")
+_GO_ON = ("run", "collect", "distill", "adapt", "evaluate", "teach-bench", "reproduce")
 """Verbs that go on where they were ended."""
 
 

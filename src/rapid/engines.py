@@ -12,6 +12,7 @@ import signal
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Literal, TypeVar, get_args
@@ -91,9 +92,24 @@ class _Waiting(Generic[Argument]):
                 self.total += 1
         return bool(self._waiting)
 
+    def put_back(self, index: int, argument: Argument) -> None:
+        """Let a job be the next again."""
+        self._waiting.appendleft((index, argument))
+
     def pop(self) -> tuple[int, Argument]:
         """Return the next job and its number."""
         return self._waiting.popleft()
+
+
+@dataclass
+class _Running(Generic[Argument]):
+    """A job and the process that does it."""
+
+    index: int
+    argument: Argument
+    process: Any
+    begun: bool
+    """Whether its end is the job's end: a process that did another job before may have ended since."""
 
 
 def check_engine(engine: str) -> None:
@@ -120,12 +136,13 @@ def _in_processes(
 ) -> Generator[tuple[int, Result], None, None]:
     # Not an executor of the standard library: those cannot be told to end their processes.
     context = multiprocessing.get_context("spawn")
-    running: dict[Connection, tuple[int, Any]] = {}
+    running: dict[Connection, _Running[Argument]] = {}
     free: list[tuple[Connection, Any]] = []
     try:
         while waiting.fill() or running:
             while len(running) < workers and waiting.fill():
                 index, argument = waiting.pop()
+                again = bool(free)
                 if not free:
                     ours, theirs = context.Pipe()
                     process = context.Process(target=_serve, args=(theirs, function), daemon=True)
@@ -135,39 +152,51 @@ def _in_processes(
                         theirs.close()
                         free.append((ours, process))
                 connection, process = free.pop()
-                running[connection] = index, process
-                with contextlib.suppress(OSError):  # one that has ended shows as the end of the pipe
+                running[connection] = _Running(index, argument, process, begun=not again)
+                with contextlib.suppress(ConnectionError):  # one that has ended shows as the end of the pipe
                     connection.send(argument)
             for connection in wait(list(running)):
                 assert isinstance(connection, Connection)
-                index, process = running[connection]
+                job = running[connection]
+                index, process = job.index, job.process
                 try:
                     kind, value = connection.recv()
-                except (EOFError, OSError):
+                except (EOFError, ConnectionError):
                     process.join(_PATIENCE)
                     why = _ended(process.exitcode)
-                    if lost is not None:
+                    if not job.begun or lost is not None:
                         del running[connection]
                         connection.close()
+                    if not job.begun:  # it ended while it had nothing to do
+                        waiting.put_back(index, job.argument)
+                        continue
+                    if lost is not None:
                         yield index, lost(index, f"its process {why}")
                         continue
                     raise RapidError(
                         f"The process of job {index + 1} of {waiting.total} {why}. What is done is kept: run the same "
                         "command again, perhaps with fewer workers."
                     ) from None
+                job.begun = True
+                if kind == "begun":
+                    continue
                 if kind == "report":
                     receive(index, value)
                     continue
                 del running[connection]
-                free.append((connection, process))  # the next job spares its start, which takes seconds
+                if waiting.fill():
+                    free.append((connection, process))  # the next job spares its start, which takes seconds
+                else:
+                    connection.close()  # it ends, and what it has of the memory is others'
+                    process.join(_PATIENCE)
                 yield index, _unpack(kind, value)
     finally:
-        for connection, (_, process) in running.items():
-            process.terminate()
+        for connection, job in running.items():
+            job.process.terminate()
             connection.close()
         for connection, _ in free:
             connection.close()
-        for process in (process for _, process in (*running.values(), *free)):
+        for process in (*(job.process for job in running.values()), *(process for _, process in free)):
             process.join(_PATIENCE)
 
 
@@ -191,9 +220,10 @@ def _serve(connection: Connection, function: Callable[[Any, Report], Any]) -> No
         except OSError:  # nobody listens any more
             raise SystemExit(1) from None
 
-    with contextlib.suppress(EOFError, OSError):
+    with contextlib.suppress(EOFError, ConnectionError):  # nobody is there any more
         while True:
             argument = connection.recv()
+            send(("begun", None))
             send(_attempt(rapid.__version__, function, argument, lambda value: send(("report", value))))
 
 

@@ -39,11 +39,7 @@ RUN = ("run.json", "config.toml", "steps", "collect", "mix", "distill", "adapt",
 
 
 class ClashError(RapidError):
-    """A place is taken by something else; `wanted` are the settings that would have had it, where they are known."""
-
-    def __init__(self, message: str, wanted: dict[str, Any] | None = None) -> None:
-        super().__init__(message)
-        self.wanted = wanted
+    """A place is taken by something else."""
 
 
 def place_for(usual: str, request: dict[str, Any]) -> Path:

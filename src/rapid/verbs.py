@@ -29,7 +29,7 @@ from rapid.options import (
     Relabel,
     Run,
 )
-from rapid.outputs import DATASET, TRAINING, ClashError, beside, claimed, clear, place_for
+from rapid.outputs import DATASET, TRAINING, ClashError, claimed, clear, place_for
 from rapid.parsing import parse
 from rapid.presets import preset
 from rapid.scenarios import get_scenario
@@ -88,24 +88,20 @@ def _run(options: Run, config: Config) -> int:
 
 def _collect(options: Collect, config: Config) -> int:
     from rapid.phases.checks import check
-    from rapid.phases.data import collect_transitions
+    from rapid.phases.data import collect_transitions, place_to_collect
 
     check(config)
     # The random driver's transitions are the other source of a mixture, from spawns of their own.
     uniform = (config.teacher.backend, config.teacher.model) == ("scripted", "random")
     source = cast(TrainPart, "random" if uniform else "teacher")
-    out = Path(options.out or f"data/{source}")
-    try:
-        with exclusive(out):
+    out = Path(options.out) if options.out else place_to_collect(config, source)
+    with exclusive(out):
+        try:
             dataset = collect_transitions(config, out, source)
-    except ClashError as clash:
-        if not options.force:
-            if options.out or clash.wanted is None:
+        except ClashError:
+            if not options.force:
                 raise
-            out = beside(str(out), clash.wanted)
-        with exclusive(out):
-            if options.force:
-                clear(out, DATASET)
+            clear(out, DATASET)
             dataset = collect_transitions(config, out, source)
     print(f"{len(dataset)} transitions in {out}")
     if not (dataset.collection or {}).get("complete", True):

@@ -20,6 +20,7 @@ from rapid.data.collection import collect
 from rapid.data.dataset import Dataset, load_dataset
 from rapid.data.driving import Budget, SpentError
 from rapid.data.unwritten import Cost, lost_in
+from rapid.errors import RapidError
 from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.decision import Decision
 from rapid.teacher.endpoint import Endpoint
@@ -165,6 +166,34 @@ def test_turns_that_were_paid_for_are_counted_where_a_conversation_ends_between_
     data = collect(driver(server, style="react"), SCENARIO, tmp_path, 120, 4)
     usage = completion()["usage"]
     assert lost_in(data.collection) == Cost(4, 4 * (usage["prompt_tokens"] + usage["completion_tokens"]), 0.0)
+
+
+@pytest.mark.parametrize("status", [402, 401])
+def test_what_was_answered_before_the_server_refused_is_kept(server: Server, tmp_path: Path, status: int):
+    """Of the four of the second step three are answered, and are not asked again."""
+    answered = threading.Semaphore(0)
+
+    def act(handler: Any, request: Any) -> None:
+        if len(server.requests) == 8 and not refused.is_set():
+            refused.set()
+            for _ in range(3):
+                assert answered.acquire(timeout=30)
+            time.sleep(0.3)
+            answer({"error": {"message": "no money"}}, status)(handler, request)
+            return
+        answer(completion("keep"))(handler, request)
+        if len(server.requests) > 4:
+            answered.release()
+
+    refused = threading.Event()
+    server.acts = [act]
+    with pytest.raises(RapidError):
+        collect(driver(server), SCENARIO, tmp_path, 120, 4)
+    before = len(server.requests)
+    assert before == 8
+    data = go_on(server, tmp_path)
+    assert len(server.requests) - before == len(data) - 7
+    assert lost_in(data.collection).decisions == 0
 
 
 def test_lessons_that_were_asked_for_are_counted(server: Server, tmp_path: Path):

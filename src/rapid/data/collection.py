@@ -100,7 +100,6 @@ def collect(
     }
     work = root / "collecting"
     with exclusive(root):
-        make_directory(work)
         dataset = _resume(root, work, settings)
         target = None if transitions is None else math.ceil(transitions / parts)
         if dataset is not None:
@@ -149,8 +148,9 @@ def _resume(root: Path, work: Path, settings: dict[str, Any]) -> Dataset | None:
     elif (work / JOURNAL_FILE).exists() or any(work.glob("part-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
     else:
-        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE), settings)
+        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE))
     check_settings(root, before, settings)
+    make_directory(work)
     if dataset is None or not dataset.collection or not dataset.collection["complete"]:
         if dataset is not None and not (work / "settings.json").exists():
             _reopen(dataset, work)

@@ -26,7 +26,15 @@ from rapid.errors import RapidError
 from rapid.progress import Task
 from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
 from rapid.seeding import stream_seed
-from rapid.teacher.decision import Decision, InterruptedDecisions, Teacher, Timed, UnfinishedError, UnreachableError
+from rapid.teacher.decision import (
+    Decision,
+    InterruptedDecisions,
+    RefusedError,
+    Teacher,
+    Timed,
+    UnfinishedError,
+    UnreachableError,
+)
 from rapid.teacher.experience import MEMORY_FILE, Experience
 from rapid.teacher.patience import StoppedError
 from rapid.termination import StoppedError as TerminatedError
@@ -201,12 +209,11 @@ class Collecting:
         with self._asked(len(wanted), known := list[Decision]()):
             try:
                 made = self.teacher.decide(seen[wanted], [previous[place] for place in wanted], keys[wanted])
-            except (UnfinishedError, InterruptedDecisions) as broken_off:
+            except (UnfinishedError, InterruptedDecisions, RefusedError, UnreachableError) as broken_off:
+                if isinstance(broken_off, UnreachableError):
+                    # What the rule decided just before, while the server was already gone, is asked again.
+                    journal.forget_end(lambda decision: decision.unanswered)
                 made = [None if decision and decision.unanswered else decision for decision in broken_off.decisions]
-                raise
-            except UnreachableError:
-                # What the rule decided just before, while the server was already gone, is asked again.
-                journal.forget_end(lambda decision: decision.unanswered)
                 raise
             finally:
                 for place, decision in zip(wanted, made, strict=False):
@@ -233,8 +240,10 @@ class Collecting:
                 self.unwritten.settle(self._guess(self.teacher.lost - before, known))
 
     def _guess(self, count: int, more: Sequence[Decision] = ()) -> Cost:
-        """Return what so many decisions cost, by the mean of those that were made, `more` among them."""
-        share = count / max(self.decisions + (self.unwritten.lost.decisions if self.unwritten else 0) + len(more), 1)
+        """Return what so many decisions or lessons cost, by the mean of those that were made, `more` among them."""
+        looked_back = sum(experience.tokens_in > 0 for experience in self.hindsight.experiences)
+        lost = self.unwritten.lost.decisions if self.unwritten else 0
+        share = count / max(self.decisions + looked_back + lost + len(more), 1)
         tokens = self.tokens + sum(decision.tokens_in + decision.tokens_out for decision in more)
         return Cost(count, round(tokens * share), (self.cost + sum(decision.cost for decision in more)) * share)
 
@@ -244,10 +253,13 @@ class Collecting:
             part = self.parts.tables[self.looked_back]
             if part is not None and (episodes := self.hindsight.pending(part)):
                 self._check_budget(0)
-                # Only a crash is asked about.
-                with self._asked(sum(episode.crashed for episode in episodes)):
+                left = sum(episode.crashed for episode in episodes)  # only a crash is asked about
+                with self._asked(left):
                     for experience in self.hindsight.look_back(episodes):
                         self._charge(experience)
+                        if experience.tokens_in and self.unwritten:
+                            left -= 1
+                            self.unwritten.ask(self._guess(left))
             self.looked_back += 1
 
     def _charge(self, experience: Experience) -> None:

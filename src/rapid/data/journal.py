@@ -171,12 +171,11 @@ def check_settings(root: Path, before: dict[str, Any] | None, settings: dict[str
     if before is not None and before != settings:
         raise ClashError(
             f"'{root}' was collected with other settings: {differences(before, settings)}. Nothing was changed. Use "
-            "the same settings to go on, choose another directory, or replace what is there with --force.",
-            settings,
+            "the same settings to go on, choose another directory, or replace what is there with --force."
         )
 
 
-def check_unclaimed(root: Path, names: Sequence[str], settings: dict[str, Any]) -> None:
+def check_unclaimed(root: Path, names: Sequence[str]) -> None:
     """Raise unless a directory in which nothing was collected is free of files that a dataset would replace.
 
     Raises:
@@ -185,6 +184,5 @@ def check_unclaimed(root: Path, names: Sequence[str], settings: dict[str, Any]) 
     if found := [name for name in names if (root / name).exists()]:
         raise ClashError(
             f"'{root}' holds {found[0]}, but nothing says that it was collected there. Nothing was changed. Choose "
-            "another directory, or replace what is there with --force.",
-            settings,
+            "another directory, or replace what is there with --force."
         )

@@ -39,18 +39,27 @@ _BETWEEN_REPORTS = 1.0
 """Seconds."""
 
 
-def shards_of(directory: Path) -> int | None:
-    """Return into how many shards the collection in `directory` is divided; None if there is none yet."""
+def settings_of(directory: Path) -> dict[str, Any] | None:
+    """Return the settings of the collection in `directory`; None if there is none yet."""
     for path, keys in (
-        (directory / "collecting" / "settings.json", ("shards",)),
-        (directory / DATASET_FILE, ("collection", "settings", "shards")),
+        (directory / "collecting" / "settings.json", ()),
+        (directory / DATASET_FILE, ("collection", "settings")),
     ):
         if path.exists():
             value = read_json(path, "record of the collection")
             for key in keys:
                 value = value.get(key) if isinstance(value, dict) else None
-            return value if isinstance(value, int) else 1
+            return value if isinstance(value, dict) else {}
     return None
+
+
+def shards_of(directory: Path) -> int | None:
+    """Return into how many shards the collection in `directory` is divided; None if there is none yet."""
+    settings = settings_of(directory)
+    if settings is None:
+        return None
+    shards = settings.get("shards")
+    return shards if isinstance(shards, int) else 1
 
 
 def collect_shards(
@@ -90,9 +99,9 @@ def collect_shards(
     driver = identity(make_teacher())
     settings = {"scenario": get_scenario(scenario).name, "source": source, "driver": driver, "shards": shards}
     with exclusive(root):
-        make_directory(work)
         before = load_dataset(root) if (root / DATASET_FILE).exists() else None
         _check_same(root, settings, before)
+        make_directory(work)
         if before is not None and (before.collection or {}).get("complete"):
             if len(before) >= transitions:
                 _remove(work)
@@ -311,7 +320,7 @@ def _check_same(root: Path, settings: dict[str, Any], dataset: Dataset | None) -
     elif any(work.glob("shard-*")):
         raise RapidError(f"'{work}' has lost its settings.json. Delete the directory to start anew.")
     else:
-        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE), settings)
+        check_unclaimed(root, (TRANSITIONS_FILE, LOG_FILE, MEMORY_FILE))
     check_settings(root, before, settings)
 
 

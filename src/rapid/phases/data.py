@@ -8,13 +8,15 @@ from typing import Any
 import torch
 
 from rapid.config import Config, TeacherConfig
-from rapid.data.collection import Budget, collect
+from rapid.config_io import differences
+from rapid.data.collection import Budget, collect, identity
 from rapid.data.dataset import Dataset, load_dataset, mix, save_dataset
-from rapid.data.sharding import collect_shards, shards_of
+from rapid.data.sharding import collect_shards, settings_of, shards_of
 from rapid.data.shipped import SHIPPED, shipped_sets
 from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
-from rapid.progress import task
+from rapid.outputs import beside
+from rapid.progress import task, warn
 from rapid.scenarios import get_scenario
 from rapid.seeding import stream_seed
 from rapid.simulator import make_vec
@@ -22,9 +24,31 @@ from rapid.spawns import TrainPart
 from rapid.teacher import Teacher, make_teacher
 
 
+def place_to_collect(config: Config, source: TrainPart) -> Path:
+    """Return where a collection goes that was given no place: data/SOURCE, or beside it if that is another's."""
+    usual = Path("data") / source
+    if not usual.exists() and not any(usual.parent.glob(f"{source}-*")):
+        return usual
+    driver = identity(
+        make_teacher(_driver(config, source), get_scenario(config.scenario).lanes, config.seed, config.scenario)
+    )
+    wanted = {"scenario": get_scenario(config.scenario).name, "source": source, "driver": driver}
+    other, there = beside(str(usual), wanted), settings_of(usual)
+    if not other.exists() and (there is None or {key: there.get(key) for key in wanted} == wanted):
+        return usual
+    if there is not None:
+        held = {key: there.get(key) for key in wanted}
+        warn(f"'{usual}' is of another request ({differences(held, wanted)}); this one is in '{other}'.")
+    return other
+
+
+def _driver(config: Config, source: TrainPart) -> TeacherConfig:
+    return config.teacher if source == "teacher" else TeacherConfig(backend="scripted", model="random")
+
+
 def collect_transitions(config: Config, out: Path, source: TrainPart = "teacher") -> Dataset:
     """Let the configured teacher drive, or for `source` random the uniform driver, and keep every step in `out`."""
-    settings = config.teacher if source == "teacher" else TeacherConfig(backend="scripted", model="random")
+    settings = _driver(config, source)
     sizes = config.collect
     wanted = sizes.teacher_transitions if source == "teacher" else sizes.random_transitions
     budget = Budget(

@@ -50,8 +50,8 @@ PLANNER = "planner"
 """Search with the simulator itself as its model: a reference, no bound."""
 RECORDED = 4
 """Episodes of the adapted agent, and of the teacher, that the report can play."""
-CRASHES = {"RAPID": 2}
-"""Crashes of an agent under each attack that the report can play; of other learned agents, one."""
+CRASHES = 2
+"""Crashes of an adapted agent under each attack that the report can play; of other learned agents, one."""
 
 
 def compare(
@@ -272,10 +272,16 @@ def _drive_under(job: tuple[Config, str, str, Any, AttackSpec, int], report: Cal
         spawn_seeds("test", spawns),
         attack,
         generator_seed=config.seed,
-        record=attack == AttackSpec() and (spec == TEACHER or agent.name == "RAPID"),
+        record=attack == AttackSpec() and (spec == TEACHER or _is_adapted(agent)),
         simulator=config.simulator,
         progress=report,
     )
+
+
+def _is_adapted(agent: Any) -> bool:
+    """Whether an agent is RAPID after phase 3, whatever it is called."""
+    config = getattr(getattr(agent, "network", None), "config", None)
+    return getattr(config, "kind", "") == "rapid" and getattr(agent, "metadata", {}).get("phase") == "adapt"
 
 
 def crashes_of(config: Config, agent: Any, driven: Sequence[tuple[AttackSpec, Episodes]]) -> list[Recording]:
@@ -284,7 +290,7 @@ def crashes_of(config: Config, agent: Any, driven: Sequence[tuple[AttackSpec, Ep
     for attack, of in driven:
         known = {recording.seed for recording in of.recordings[:RECORDED]}
         seeds = [int(seed) for seed in of.seed_E[of.crashed_E] if int(seed) not in known]
-        seeds = seeds[: CRASHES.get(of.agent, 1)] if of.kind == "learned" else []
+        seeds = seeds[: CRASHES if _is_adapted(agent) else 1] if of.kind == "learned" else []
         if seeds:
             again = run_episodes(
                 agent,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from rapid.errors import RapidError
 from rapid.progress import format_seconds, warn
 from rapid.teacher.logprobs import Token
 from rapid.teacher.patience import Patience, StoppedError
@@ -138,9 +139,11 @@ def attend(jobs: Sequence[Callable[[], T]], patience: Patience, concurrency: int
     """Do jobs that wait for a server, `concurrency` at once, and give what came of each in their order, or None.
 
     A line says what is waited for if that takes long. The first KeyboardInterrupt lets the requests under way end and
-    begins no others, the second lets them go; it is raised again when all that came has been given.
+    begins no others, the second lets them go; it is raised again when all that came has been given. So is the first
+    error of a job, after which nothing is begun or waited for.
     """
     interrupted = False
+    failed: RapidError | None = None
     pool = ThreadPoolExecutor(max(concurrency, 1))
     try:
         futures = [pool.submit(job) for job in jobs]
@@ -169,7 +172,12 @@ def attend(jobs: Sequence[Callable[[], T]], patience: Patience, concurrency: int
                 result = future.result()
             except StoppedError:
                 result = None
+            except RapidError as error:
+                failed, result = failed or error, None
+                patience.drop()
             yield result
+        if failed:
+            raise failed
         if interrupted:
             raise KeyboardInterrupt
     finally:
@@ -198,10 +206,10 @@ def _in_lockstep(
             given += 1
         try:
             answers = dict(zip(waiting, answer(list(waiting.values())), strict=True)) if waiting else {}
-        except StoppedError as stopped:
+        except RapidError as error:
             for number in waiting:
-                with suppress(StoppedError):  # it learns of it, in case that something was paid for it already
-                    conversations[number].throw(stopped)
+                with suppress(RapidError):  # it learns of it, in case that something was paid for it already
+                    conversations[number].throw(error)
             raise
 
 

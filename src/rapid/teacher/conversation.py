@@ -11,13 +11,14 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
-from rapid.errors import sentence
+from rapid.errors import RapidError, sentence
 from rapid.progress import warn
 from rapid.scenarios import IDLE
 from rapid.teacher.answers import EXPLANATION_LIMIT, Choice, read_choice, spoken
@@ -35,7 +36,14 @@ from rapid.teacher.chat import (
     converse,
     patience_of,
 )
-from rapid.teacher.decision import NO_ANSWER, Decision, InterruptedDecisions, UnfinishedError, UnreachableError
+from rapid.teacher.decision import (
+    NO_ANSWER,
+    Decision,
+    InterruptedDecisions,
+    RefusedError,
+    UnfinishedError,
+    UnreachableError,
+)
 from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts, gather, safest
 from rapid.teacher.logprobs import Token, action_probabilities
@@ -80,6 +88,11 @@ class _Talk:
         self.retries += reply.retries
         self.answer, self.tokens, self.served = reply.text, reply.tokens, reply.model
         self.turns += 1
+
+
+def _done(greet: Callable[[], None]) -> bool:
+    greet()
+    return True
 
 
 def _opening(prompt: Prompt) -> list[Message]:
@@ -140,8 +153,12 @@ class ConversingTeacher:
         if isinstance(self._chat, BatchChat):
             seconds = (time.perf_counter() - start) / max(len(decisions), 1)
             decisions = [dataclasses.replace(decision, seconds=seconds) for decision in decisions]
-        for decision in decisions:
-            self._watch(decision.error if decision.unanswered else "")
+        try:
+            for decision in decisions:
+                self._watch(decision.error if decision.unanswered else "")
+        except UnreachableError as error:
+            error.decisions = decisions
+            raise
         return decisions
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
@@ -175,8 +192,9 @@ class ConversingTeacher:
         """Before anything is driven, look whether the server is there and answers a question."""
         if self._greet is None:
             return
-        for _ in attend([self._greet], self._patience):
-            self._patience.check()
+        # To its end, where it raises what broke it off.
+        if list(attend([partial(_done, self._greet)], self._patience)) == [None]:
+            raise StoppedError(self._patience.reason)
         facts = gather(read_scenes(np.zeros((1, 1, 5), np.float32), self._lanes)[0])
         [decision] = self._lead([self._decide(facts, None)])
         if decision is None:
@@ -201,6 +219,10 @@ class ConversingTeacher:
         except KeyboardInterrupt:
             all_of = [*made, *[None] * (len(conversations) - len(made))]
             raise InterruptedDecisions(all_of) from None
+        except StoppedError:
+            raise
+        except RapidError as error:
+            raise RefusedError(str(error), made) from error
         decisions = [decision for decision in made if decision is not None]
         if len(decisions) < len(made):
             raise UnfinishedError(self._patience.reason, made)
@@ -237,8 +259,8 @@ class ConversingTeacher:
                 choice = read_lesson(reply.text, facts, _was_cut(reply))
         except ChatError as error:
             lost = f"{NO_ANSWER}: {error}"
-        except StoppedError as stopped:
-            self._count_turns(talk, stopped)
+        except RapidError as error:
+            self._count_turns(talk, error)
             raise
         if choice.action is not None:
             # The reason was that of the decision that led to the crash.
@@ -248,9 +270,9 @@ class ConversingTeacher:
         spent = {"tokens_in": talk.tokens_in, "tokens_out": talk.tokens_out, "cost": self._cost(talk)}
         return dataclasses.replace(experience, **spent), lost
 
-    def _count_turns(self, talk: _Talk, stopped: StoppedError) -> None:
+    def _count_turns(self, talk: _Talk, error: RapidError) -> None:
         """Count a conversation that ends between two turns; a request under way has been counted."""
-        if talk.turns and not stopped.under_way:
+        if talk.turns and not (isinstance(error, StoppedError) and error.under_way):
             self._patience.lose()
 
     def _cost(self, talk: _Talk) -> float:
@@ -269,8 +291,8 @@ class ConversingTeacher:
         except ChatError as error:
             talk.retries += error.retries
             talk.faults.append(f"{NO_ANSWER}: {error}")
-        except StoppedError as stopped:
-            self._count_turns(talk, stopped)
+        except RapidError as error:
+            self._count_turns(talk, error)
             raise
         status, action, computed, probabilities = "repaired" if talk.faults else "ok", choice.action, "", None
         if action is None:

@@ -22,7 +22,17 @@ NO_ANSWER = "no answer"
 
 
 class UnreachableError(RapidError):
-    """The model's server gives no answers; what was decided meanwhile was decided by nobody who was asked."""
+    """The model's server gives no answers; `decisions` holds what was decided meanwhile, in part by nobody asked."""
+
+    decisions: Sequence["Decision | None"] = ()
+
+
+class RefusedError(RapidError):
+    """Nothing more can be asked; `decisions` holds those that were made before, and None."""
+
+    def __init__(self, message: str, decisions: Sequence["Decision | None"]) -> None:
+        super().__init__(message)
+        self.decisions = decisions
 
 
 class UnfinishedError(StoppedError):

@@ -15,19 +15,19 @@ from rapid.config_learning import DistillConfig, LossConfig, NetworkConfig
 from rapid.data.replay import OfflineSampler
 from rapid.data.transitions import TEACHER, Transitions
 from rapid.errors import RapidError
+from rapid.networks.denormals import no_denormals
 from rapid.networks.q_network import QNetwork, set_phase
 from rapid.networks.stack import unstack_networks
 from rapid.progress import Task
 from rapid.seeding import numpy_stream, torch_stream
 from rapid.training.learner import Learner
-from rapid.training.machinery.adam import flush_denormals
 from rapid.training.machinery.record import Evaluate, Record, Track, crossed, fingerprint, network_fingerprint
 
 LOG_EVERY = 100
 
 
 @termination.waiting()
-@flush_denormals()
+@no_denormals()
 def distill(
     transitions: Transitions,
     network: QNetwork,

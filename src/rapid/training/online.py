@@ -14,12 +14,12 @@ from rapid.config_learning import AdaptConfig, PpoConfig
 from rapid.data.replay import OfflineSampler, ReplayBuffer, join_batches
 from rapid.data.transitions import Transitions
 from rapid.errors import RapidError
+from rapid.networks.denormals import no_denormals
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.training.learner import Learner
-from rapid.training.machinery.adam import flush_denormals
 from rapid.training.machinery.diagnostics import Forgetting, gate_size
 from rapid.training.machinery.record import Evaluate, Record, Track, crossed, network_fingerprint
 from rapid.training.machinery.worlds import Drive, Explorer, MakeWorlds, default_worlds
@@ -30,7 +30,7 @@ LOG_EVERY = 1_000
 
 
 @termination.waiting()
-@flush_denormals()
+@no_denormals()
 def adapt(
     network: QNetwork,
     config: AdaptConfig,

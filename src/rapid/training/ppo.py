@@ -25,12 +25,13 @@ from rapid.config_learning import AdaptConfig, NetworkConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
 from rapid.networks.blocks import compiled_attention
+from rapid.networks.denormals import no_denormals
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
 from rapid.seeding import numpy_stream, stream_seed
 from rapid.training.collector import Collector, Rollout
-from rapid.training.machinery.adam import Adam, clip_norm, flush_denormals
+from rapid.training.machinery.adam import Adam, clip_norm
 from rapid.training.machinery.diagnostics import Forgetting, gate_size
 from rapid.training.machinery.record import Evaluate, Record, Track, crossed, network_fingerprint
 from rapid.training.machinery.worlds import Drive, MakeWorlds, default_worlds
@@ -43,7 +44,7 @@ moved from the one that drove."""
 
 
 @termination.waiting()
-@flush_denormals()
+@no_denormals()
 def adapt_by_ppo(
     network: QNetwork,
     config: AdaptConfig,
@@ -230,7 +231,7 @@ class PpoLearner:
         minibatches = [rows_B for order_N in orders for rows_B in order_N.split(self.config.batch_size)]
         if self._beside:
             with ThreadPoolExecutor(1) as other:
-                critic = other.submit(flush_denormals()(self._teach_critic), rollout, minibatches)
+                critic = other.submit(no_denormals()(self._teach_critic), rollout, minibatches)
                 self._teach_policy(rollout, minibatches)
                 critic.result()
         else:
