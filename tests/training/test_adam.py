@@ -3,7 +3,8 @@ import copy
 import pytest
 import torch
 
-from rapid.training.machinery.adam import Adam, clip_norm, flush_denormals
+from rapid.networks.denormals import no_denormals
+from rapid.training.machinery.adam import Adam, clip_norm
 
 
 def weights() -> list[torch.Tensor]:
@@ -79,12 +80,12 @@ def test_the_averages_of_weights_without_gradient_reach_zero_and_the_process_is_
         return adam.state_dict()["mean"][0].item()
 
     assert 0 < mean_after(850) < 1.2e-38
-    with flush_denormals():
+    with no_denormals():
         assert mean_after(850) == 0
     assert (tiny * 1).item() > 0
     torch.set_flush_denormal(True)
     try:
-        with flush_denormals():
+        with no_denormals():
             pass
         assert (tiny * 1).item() == 0
     finally:
