@@ -193,6 +193,16 @@ def validate(config: Config) -> Config:
             adapt.adversary.noise_share == 0 or adapt.ppo.steps > 0,
             "0 where adapt.ppo.steps is 0: Q-learning is not attacked",
         ),
+        (
+            "adapt.adversary.guided",
+            adapt.adversary.guided == 0 or adapt.memory,
+            "0 where adapt.memory is false: what is shown is a plan that goes by the time",
+        ),
+        (
+            "adapt.adversary.guided",
+            adapt.adversary.begin + adapt.adversary.guided <= 1,
+            f"at most 1 together with adapt.adversary.begin = {adapt.adversary.begin:g}",
+        ),
         ("evaluate.attacks", len(config.evaluate.attacks) >= 1, "at least one name, such as none"),
     ]
     for name, good, expected in checks:

@@ -202,6 +202,8 @@ class PpoConfig:
     """Of the steps, the first ones, in which the critic alone learns."""
     learning_rate: AboveZero = 3e-4
     """Adam's step size for the policy; falls linearly to zero."""
+    guide_rate: AboveZero = 1e-3
+    """The same while the policy is shown what to do (`adapt.adversary.guided`)."""
     critic_rate: AboveZero = 1e-3
     """Adam's step size for the critic."""
     max_grad_norm: AboveZero = 0.5
@@ -221,8 +223,13 @@ class AdversaryConfig:
     """
 
     gradient_share: Share = 0.0
-    """Share of the episodes under projected gradients. At each step half of them climb from a random point of the
-    ball, and half from the truth, with steps that just reach the ball's edge."""
+    """Share of the episodes under projected gradients."""
+    near_share: Share = 0.5
+    """At each step, so many of them climb from the truth, with steps that just reach the ball's edge, as the attacks
+    that are measured do; the others climb from a random point of the ball."""
+    spared_share: Share = 0.0
+    """At each step, so many of them leave the ego's own row alone. A memory notices lies about the ego, and would trust
+    everything else."""
     targeted_share: Share = 0.5
     """Of those, the share in which each step drives the policy towards an action drawn by chance; the others drive it
     away from what it would do."""
@@ -239,7 +246,12 @@ class AdversaryConfig:
     begin: ShareBelowOne = 0.0
     """Share of PPO's steps before the first attack, in which the policy learns what pays."""
     ramp: Share = 0.0
-    """Share of PPO's steps after that over which radius and noise grow to their size."""
+    """Share of PPO's steps after that over which radius and noise grow to their size; without a guide alone."""
+    guided: Share = 0.0
+    """Share of PPO's steps, from the first attack on, in which the policy does not try what pays but is shown what to
+    do: under attack what a plan says, otherwise what it did before (:mod:`rapid.training.machinery.guide`)."""
+    plan: str = ""
+    """That plan, as of the driver `blind`, such as 13,2,8; nothing is blind's own in the scenario."""
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ from rapid.evaluation.statistics import estimate
 from rapid.files import write_json
 from rapid.progress import task
 from rapid.runs import commit
-from rapid.scenarios import FASTER, IDLE, LANE_RIGHT, PAPER_SCENARIOS, SLOWER, get_scenario
+from rapid.scenarios import IDLE, PAPER_SCENARIOS, get_scenario
 from rapid.simulator import make_vec
 from rapid.simulator.compile import kernel_stamp
 from rapid.spawns import spawn_seeds
-from rapid.teacher.scripted import PLANS, Plan
+from rapid.teacher.scripted import PLANS, Plan, plan_actions
 
 SLOWER_UP_TO, FASTER_UP_TO = 16, 8
 FIRST, FINALISTS, MORE = 60, 16, 340
@@ -44,7 +44,7 @@ def returns(scenario: str, plans: Sequence[Plan], seeds: Sequence[int]) -> NDArr
     steps = math.ceil(worlds.settings.duration / worlds.settings.decision_time)
     earned = np.empty((len(plans), len(seeds)))
     for number, plan in enumerate(plans):
-        actions_T = _actions(plan, steps)
+        actions_T = np.array((plan_actions(plan) + [IDLE] * steps)[:steps], np.int64)
         foreseen = worlds.forecast(np.tile(actions_T, (len(seeds), 1)))
         # Forecasts drive on after an end; what comes after the first does not count.
         ended_ST = foreseen.terminated | foreseen.truncated
@@ -73,12 +73,6 @@ def search(scenario: str) -> dict[str, Any]:
         "spawns": len(seeds),
         "plans": len(plans),
     }
-
-
-def _actions(plan: Plan, steps: int) -> NDArray[np.int64]:
-    slower, right, faster = plan
-    actions = [SLOWER] * slower + [LANE_RIGHT] * right + [FASTER] * faster
-    return np.array((actions + [IDLE] * steps)[:steps], np.int64)
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ from rapid.agents.q_agent import QAgent
 from rapid.agents.saved import load_agent, save_agent
 from rapid.config import Config, without_place
 from rapid.config_io import parts_of, to_dict
-from rapid.config_learning import NetworkConfig
+from rapid.config_learning import AdaptConfig, NetworkConfig
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.networks.q_network import build_network, check_memory, for_lanes, widened, with_memory
@@ -19,6 +19,7 @@ from rapid.progress import task
 from rapid.scenarios import get_scenario, seeing
 from rapid.seeding import stream_seed
 from rapid.simulator import make_vec
+from rapid.teacher.scripted import plan_actions, plan_for, read_plan
 from rapid.tracking import Tracker
 from rapid.training.machinery.diagnostics import Forgetting
 from rapid.training.online import adapt
@@ -49,6 +50,17 @@ def learn_online(config: Config, out: Path, name: str) -> QAgent:
     return adapt_agent(config, start, None, out, name)
 
 
+def shown_plan(settings: AdaptConfig, scenario: str) -> list[int]:
+    """Return the plan that the policy is shown under attack, if it is to be shown any.
+
+    Raises:
+        RapidError: `blind` has none in this scenario and the settings name none, or none that can be read.
+    """
+    if not settings.adversary.guided:
+        return []
+    return plan_actions(read_plan(settings.adversary.plan) if settings.adversary.plan else plan_for(scenario))
+
+
 def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name: str = "RAPID") -> QAgent:
     """Let the agent in `agent` learn online in the target scenario; it is written to ``out/agent``."""
     distilled = load_agent(agent, config.device)
@@ -77,6 +89,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     if settings.shield:
         network.config = replace(network.config, shield=settings.shield)
     check_road(QAgent(network, distilled.name), scenario)
+    plan = shown_plan(settings, scenario)
     evaluate, seen = learning_curve(config, scenario, name), seeing(network.config.vehicles)
     tracker = Tracker(config.tracking, out, f"adapt-{name}".replace(" ", "-"), to_dict(without_place(config)))
     rollout = settings.ppo.num_envs * settings.ppo.rollout
@@ -112,6 +125,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 progress=work,
                 make_worlds=lambda count: make_vec(timed, count, config.simulator, config=seen),
                 track=tracker.log,
+                plan=plan,
             )
     metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
     # What was used, which need not be what was asked for.

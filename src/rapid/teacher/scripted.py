@@ -194,6 +194,12 @@ def plan_for(scenario: str) -> Plan:
     return slower, right, faster
 
 
+def plan_actions(plan: Plan) -> list[int]:
+    """Return the actions of a plan; after the last comes IDLE."""
+    slower, right, faster = plan
+    return [SLOWER] * slower + [LANE_RIGHT] * right + [FASTER] * faster
+
+
 def _wait(present: bool) -> tuple[int, str, None]:
     """Brake while any car is present, wherever it is said to be: a scene leaves out what is said to be far away."""
     return (SLOWER, "another car is there", None) if present else (FASTER, "no car is there", None)
@@ -202,7 +208,6 @@ def _wait(present: bool) -> tuple[int, str, None]:
 def _follow(plan: Plan, previous: Decision | None) -> tuple[int, str, None]:
     """Return the next action of the plan. What a driver remembers is its last decision, so that carries the count."""
     step = 0 if previous is None else int(previous.explanation.rpartition(" ")[2]) + 1
-    slower, right, faster = plan
-    actions = [SLOWER] * slower + [LANE_RIGHT] * right + [FASTER] * faster
+    actions = plan_actions(plan)
     action = actions[step] if step < len(actions) else IDLE
     return action, f"decision {step}", None

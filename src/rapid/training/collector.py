@@ -6,6 +6,7 @@ remembers what the car knows by itself; the critic and the reward have the truth
 Shapes: T steps of a rollout, W worlds, N = T*W transitions, V vehicles, F features, S entries of a memory's state.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ from rapid.errors import RapidError
 from rapid.seeding import numpy_stream, torch_stream
 from rapid.training.learner import check_generator
 from rapid.training.machinery.adversary import CLEAN, Adversary
+from rapid.training.machinery.guide import Guide
 from rapid.training.machinery.worlds import Drive, Explorer
 
 ATTACKED = 2.0
@@ -60,6 +62,8 @@ class Rollout(NamedTuple):
     advantage_N: Tensor
     return_N: Tensor
     """The critic's target."""
+    shown_NA: Tensor | None = None
+    """The probabilities that a guide showed, if there was one."""
     first_NVD: Tensor | None = None
     """Policy 1's tokens of what was seen, if no update changes them."""
 
@@ -78,13 +82,23 @@ class Collector:
         scale_F: what 1 means in each normalised feature.
         seed: of actions, exploration and attacks.
         device: where tensors go.
+        make_guide: gives the guide when its time has come; None is no guide.
     """
 
     def __init__(
-        self, drive: Drive, config: PpoConfig, adversary: AdversaryConfig, scale_F: Tensor, seed: int, device: str
+        self,
+        drive: Drive,
+        config: PpoConfig,
+        adversary: AdversaryConfig,
+        scale_F: Tensor,
+        seed: int,
+        device: str,
+        make_guide: Callable[[], Guide] | None = None,
     ) -> None:
         self.drive, self.config, self._device = drive, config, device
-        self._begin, self._ramp, self._size = adversary.begin, adversary.ramp, 1.0
+        self.mixture, self._size = adversary, 1.0
+        self._make_guide = make_guide
+        self.guide: Guide | None = None
         self._sampler = torch_stream(seed, "ppo/actions", device)
         self._liar = torch_stream(seed, "ppo/adversary", device)
         self.adversary = Adversary(adversary, config.num_envs, scale_F, config.temperature, self._liar)
@@ -105,7 +119,7 @@ class Collector:
             RapidError: an observation or a Q-value is not finite.
         """
         config, device = self.config, self._device
-        self._size = min(max(done - self._begin, 0.0) / self._ramp, 1.0) if self._ramp else float(done >= self._begin)
+        guide = self._prepare(done - self.mixture.begin)
         epsilon = config.exploration * max(1 - 2 * done, 0.0)
         obs: list[Tensor] = []
         seen: list[Tensor] = []
@@ -114,6 +128,7 @@ class Collector:
         log_probs: list[Tensor] = []
         rewards: list[Tensor] = []
         ended: list[Tensor] = []
+        shown: list[Tensor] = []
         for _ in range(config.rollout):
             obs_WVF, state_WS = self._observed()
             seen_WVF = self.adversary(learner.q_values, learner.as_seen(obs_WVF), state_WS, self._size)
@@ -127,6 +142,10 @@ class Collector:
             if epsilon:
                 explores_W = torch.from_numpy(self._explorer.begin(epsilon, self._rng)).to(device)
                 action_W = torch.where(explores_W, torch.from_numpy(self._explorer.held_W).to(device), action_W)
+            if guide is not None and state_WS is not None:
+                shown_WA = guide(learner.as_seen(obs_WVF), state_WS, self.adversary.kind_W != CLEAN)
+                action_W = guide.drive(action_W, shown_WA)
+                shown.append(shown_WA)
             obs.append(self._told(obs_WVF))
             seen.append(seen_WVF)
             if state_WS is not None:
@@ -139,6 +158,8 @@ class Collector:
             ended_W = terminated_W | truncated_W
             ended.append(torch.from_numpy(ended_W).to(device))
             self.adversary.begin(ended_W)
+            if guide is not None:
+                guide.begin(ended_W)
         # After an end comes the next episode, whose first value counts for nothing.
         last_WVF = self._told(self._observed()[0])
         value_TW = torch.stack([learner.values(told_WVF) for told_WVF in [*obs, last_WVF]])
@@ -152,7 +173,20 @@ class Collector:
             torch.cat(log_probs),
             advantage_TW.flatten(),
             (advantage_TW + value_TW[:-1]).flatten(),
+            torch.cat(shown) if shown else None,
         )
+
+    def _prepare(self, after: float) -> Guide | None:
+        """Decide how large attacks are and who shows what to do, so long (share of all steps) after attacks begin."""
+        mixture, guided = self.mixture, self._make_guide is not None
+        ramp = 0.0 if guided else mixture.ramp
+        self._size = min(max(after, 0.0) / ramp, 1.0) if ramp else float(after >= 0)
+        if self._make_guide is None or not 0 <= after < mixture.guided:
+            self.guide = None
+        else:
+            self.guide = self.guide or self._make_guide()
+            self.guide.left = 1 - after / mixture.guided
+        return self.guide
 
     def _observed(self) -> tuple[Tensor, Tensor | None]:
         """Return the true observations (W, V, F) and what is remembered there (W, S)."""
@@ -177,6 +211,7 @@ class Collector:
             "kinds": self.adversary.kind_W,
             "explorer": self._explorer.state_dict(),
             "rng": self._rng.bit_generator.state,
+            "guide": None if self.guide is None else self.guide.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -192,6 +227,9 @@ class Collector:
         self.adversary.kind_W = state["kinds"]
         self._explorer.load_state_dict(state["explorer"])
         self._rng.bit_generator.state = state["rng"]
+        if (guide := state.get("guide")) is not None and self._make_guide is not None:
+            self.guide = self._make_guide()
+            self.guide.load_state_dict(guide)
 
 
 def advantages(reward_TW: Tensor, value_TW: Tensor, ended_TW: Tensor, discount: float, trace: float) -> Tensor:

@@ -10,7 +10,7 @@ Shapes: N transitions of a rollout, B a minibatch, V vehicles, F features, S ent
 """
 
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -29,18 +29,20 @@ from rapid.networks.denormals import no_denormals
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
 from rapid.scenarios import get_scenario
-from rapid.seeding import numpy_stream, stream_seed
+from rapid.seeding import numpy_stream, stream_seed, torch_stream
 from rapid.training.collector import Collector, Rollout
 from rapid.training.machinery.adam import Adam, clip_norm
 from rapid.training.machinery.diagnostics import Forgetting, gate_size
+from rapid.training.machinery.guide import Guide
 from rapid.training.machinery.record import Evaluate, Record, Track, crossed, network_fingerprint
 from rapid.training.machinery.worlds import Drive, MakeWorlds, default_worlds
 
 VALUE_SCALE = 10.0
 """By what the critic's output is multiplied: returns of 30 s reach some 30."""
-TERMS = ("value", "policy", "entropy", "kl")
-"""What is recorded of every update, the first alone while only the critic learns; `kl` estimates how far the policy has
-moved from the one that drove."""
+VALUE, TERMS, SHOWN = ("value",), ("policy", "entropy", "kl"), ("shown", "follows")
+"""What is recorded of every update of the critic, of the policy, and of the policy while a guide shows what to do. `kl`
+estimates how far the policy has moved from the one that drove, `shown` is the cross-entropy to what is shown, `follows`
+the share of greedy actions that are the shown ones."""
 
 
 @termination.waiting()
@@ -58,6 +60,7 @@ def adapt_by_ppo(
     make_worlds: MakeWorlds | None = None,
     checkpoint_seconds: float = 60.0,
     track: Track | None = None,
+    plan: Sequence[int] = (),
 ) -> QNetwork:
     """Train `network` in place for `config.ppo.steps` and return it; the same call goes on from the last checkpoint.
 
@@ -73,10 +76,11 @@ def adapt_by_ppo(
         make_worlds: gives worlds of `scenario` whose observation tells the time; None is `rapid.make_vec`.
         checkpoint_seconds: time between two checkpoints.
         track: is given every row of metrics; their steps go on from `config.steps`.
+        plan: the actions of an episode that a guide shows under attack (`config.adversary.guided`).
 
     Raises:
-        RapidError: steps that teach the policy nothing, a loss that is not finite (the last good checkpoint stays), or
-            a directory of another training.
+        RapidError: a guide for a network without a memory, or without a plan; steps that teach the policy nothing, a
+            loss that is not finite (the last good checkpoint stays), or a directory of another training.
     """
     if network.is_stack:
         raise RapidError("A stack of networks cannot drive. Adapt one network at a time.")
@@ -87,6 +91,11 @@ def adapt_by_ppo(
         raise RapidError(
             f"adapt.ppo.steps is {ppo.steps}, but the policy learns nothing in less than {least_steps(ppo)}: "
             f"adapt.ppo.critic_steps = {ppo.critic_steps} in whole rollouts, and one more. Raise it."
+        )
+    if config.adversary.guided and (network.memory is None or not plan):
+        raise RapidError(
+            "adapt.adversary.guided shows the policy a plan that goes by the time, so it needs a network with a memory "
+            "(adapt.memory) and that plan. Set adapt.adversary.guided to 0 to leave the guide out."
         )
     per_rollout = ppo.num_envs * ppo.rollout
     # No more than asked for: whole rollouts would otherwise go beyond a budget.
@@ -101,7 +110,8 @@ def adapt_by_ppo(
             "weights": network_fingerprint(network),
             "scenario": scenario,
             "seed": seed,
-        },
+        }
+        | ({"plan": list(plan)} if config.adversary.guided else {}),
         checkpoint_seconds,
         track,
     )
@@ -110,7 +120,19 @@ def adapt_by_ppo(
     make_worlds = make_worlds or default_worlds(replace(seen, clock=True), network.config.vehicles)
     lanes = network.lanes if network.config.memory else None
     drive = Drive(make_worlds, ppo.num_envs, stream_seed(seed, "ppo"), lanes)
-    collector = Collector(drive, ppo, config.adversary, network.scale_F, seed, device)
+
+    def make_guide() -> Guide:
+        return Guide(network, plan, ppo, torch_stream(seed, "ppo/guide", device))
+
+    collector = Collector(
+        drive,
+        ppo,
+        config.adversary,
+        network.scale_F,
+        seed,
+        device,
+        make_guide if config.adversary.guided else None,
+    )
     before = -(-config.steps // config.num_envs) * config.num_envs
     done = 0
 
@@ -126,7 +148,8 @@ def adapt_by_ppo(
 
     while done < rollouts:
         with learner.computing():
-            learner.update(collector.collect(learner, done / rollouts))
+            rollout = collector.collect(learner, done / rollouts)
+            learner.update(rollout, collector.guide.left if collector.guide else 1.0)
         done += 1
         steps, last = before + done * per_rollout, done == rollouts
         row = {
@@ -179,6 +202,7 @@ class PpoLearner:
         self.rollouts = self.updates = 0
         self._values: list[Tensor] = []
         self._terms: list[Tensor] = []
+        self._shown: list[Tensor] = []
 
     @property
     def learning_rate(self) -> float:
@@ -220,8 +244,11 @@ class PpoLearner:
         """Return what the critic expects until the end of the episode (B,)."""
         return VALUE_SCALE * self.critic(obs_BVF).mean(1)
 
-    def update(self, rollout: Rollout) -> None:
+    def update(self, rollout: Rollout, left: float = 1.0) -> None:
         """Learn from a rollout: several passes over it in minibatches.
+
+        Where a guide showed what to do, the policy learns that and the critic nothing; the step size is that of the
+        settings times `left`, the share of the guide's time that is left.
 
         Neither of policy and critic reads what the other learns, so in a process that may use several threads they
         learn beside each other; the result is the same, bit for bit.
@@ -229,7 +256,9 @@ class PpoLearner:
         count, device = len(rollout.action_N), rollout.obs_NVF.device
         orders = [torch.from_numpy(self._rng.permutation(count)).to(device) for _ in range(self.config.epochs)]
         minibatches = [rows_B for order_N in orders for rows_B in order_N.split(self.config.batch_size)]
-        if self._beside:
+        if rollout.shown_NA is not None:
+            self._follow(rollout, minibatches, self.config.guide_rate * left)
+        elif self._beside:
             with ThreadPoolExecutor(1) as other:
                 critic = other.submit(no_denormals()(self._teach_critic), rollout, minibatches)
                 self._teach_policy(rollout, minibatches)
@@ -253,7 +282,7 @@ class PpoLearner:
             gradients = torch.autograd.grad(value, self._critics, materialize_grads=True)
             clip_norm(gradients, self.config.critic_max_grad_norm)
             self._critic_adam.step(gradients, self.config.critic_rate)
-            self._values.append(value.detach())
+            self._values.append(value.detach()[None])
 
     def _teach_policy(self, rollout: Rollout, minibatches: list[Tensor]) -> None:
         rate = self.learning_rate
@@ -263,6 +292,18 @@ class PpoLearner:
         for rows_B in minibatches:
             if not self._take_step(rollout.rows(rows_B), rate):
                 break
+
+    def _follow(self, rollout: Rollout, minibatches: list[Tensor], rate: float) -> None:
+        """Move the policy towards what a guide showed, by cross-entropy."""
+        for batch in map(rollout.rows, minibatches):
+            shown_BA = cast(Tensor, batch.shown_NA)
+            log_prob_BA = self.log_probs(batch.seen_NVF, batch.state_NS)
+            loss = -(shown_BA * log_prob_BA).sum(1).mean()
+            gradients = torch.autograd.grad(loss, self._trained, materialize_grads=True)
+            clip_norm(gradients, self.config.max_grad_norm)
+            self._adam.step(gradients, rate)
+            follows = (log_prob_BA.detach().argmax(1) == shown_BA.argmax(1)).float().mean()
+            self._shown.append(torch.stack([loss.detach(), follows]))
 
     def _take_step(self, batch: Rollout, rate: float) -> bool:
         """Move the policy; return whether it may go on, for it is not yet too far from the one that drove."""
@@ -288,19 +329,21 @@ class PpoLearner:
         Raises:
             RapidError: a term or a weight is not finite.
         """
-        value_U = torch.stack(self._values).cpu().double()
-        terms_UT = torch.stack(self._terms).cpu().double() if self._terms else torch.zeros(0, 0)
-        self._values.clear()
-        self._terms.clear()
-        trained = (*self._trained, *self._critics)
-        finite = bool(value_U.isfinite().all()) and bool(terms_UT.isfinite().all())
-        if not finite or not all(bool(weight.isfinite().all()) for weight in trained):
+        means: dict[str, float] = {}
+        weights = (*self._trained, *self._critics)
+        finite = all(bool(weight.isfinite().all()) for weight in weights)
+        for names, terms in ((VALUE, self._values), (TERMS, self._terms), (SHOWN, self._shown)):
+            if terms:
+                terms_UT = torch.stack(terms).cpu().double()
+                finite &= bool(terms_UT.isfinite().all())
+                means |= zip(names, terms_UT.mean(0).tolist(), strict=True)
+            terms.clear()
+        if not finite:
             raise RapidError(
                 f"Training stopped by update {self.updates} of PPO: a loss or a weight is not finite. Lower "
                 "adapt.ppo.learning_rate or adapt.ppo.critic_rate."
             )
-        means = terms_UT.mean(0).tolist() if len(terms_UT) else []
-        return dict(zip(TERMS, [float(value_U.mean()), *means], strict=False))
+        return means
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that `load_state_dict` needs; call `means` first, the recorded terms are not in it."""

@@ -110,11 +110,17 @@ class Adversary:
         sign_B = torch.where(towards_B, -1.0, 1.0)
         # The attacks of the paper's table read Q-values at temperature 1, the policy acts at its own.
         temperature_B1 = torch.where(towards_B, self._temperature, 1.0)[:, None]
-        low_BVF, high_BVF = obs_BVF - config.radius * reach_F, obs_BVF + config.radius * reach_F
-        # Half climb in short steps from the truth, as the attacks that are measured do; who starts far away is noticed.
-        near_B = torch.rand(len(obs_BVF), generator=self._generator, device=self._generator.device) < 0.5
+        # Who starts far away is noticed. So some climb in short steps from the truth, as the attacks that are measured.
+        near_B = torch.rand(len(obs_BVF), generator=self._generator, device=self._generator.device) < config.near_share
         near_B11 = near_B.to(obs_BVF.device)[:, None, None]
         start_BVF = obs_BVF + self._draw(obs_BVF) * (config.radius * size)
+        if config.spared_share:
+            drawn_B = torch.rand(len(obs_BVF), generator=self._generator, device=self._generator.device)
+            spared_B = (drawn_B < config.spared_share).to(obs_BVF.device)
+            reach_F = reach_F.expand_as(obs_BVF).clone()
+            reach_F[spared_B, 0] = 0
+            start_BVF[spared_B, 0] = obs_BVF[spared_B, 0]
+        low_BVF, high_BVF = obs_BVF - config.radius * reach_F, obs_BVF + config.radius * reach_F
         seen_BVF = torch.where(near_B11, obs_BVF, start_BVF)
         step_BVF = torch.where(near_B11, config.radius / config.steps, config.step_size) * reach_F
         with torch.enable_grad():
