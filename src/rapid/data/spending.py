@@ -1,0 +1,71 @@
+"""What a collection has used: tokens and price of what was written down, and of what was paid for all the same."""
+
+import sys
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rapid.data.unwritten import UNWRITTEN_FILE, Cost, Unwritten
+from rapid.teacher.decision import Decision, Teacher, Timed
+from rapid.teacher.experience import Experience
+from rapid.termination import StoppedError as TerminatedError
+
+
+def cost_of(answers: Iterable[Decision | Experience]) -> Cost:
+    """Return what decisions, and lessons from crashes, cost; an experience that nobody was asked about is none."""
+    found = Cost()
+    for answer in answers:
+        counts = isinstance(answer, Decision) or answer.tokens_in > 0
+        found += Cost(int(counts), answer.tokens_in + answer.tokens_out, answer.cost)
+    return found
+
+
+class Spending:
+    """The sum, and what is asked for at the moment; of a teacher that waits for others it outlives a kill."""
+
+    def __init__(self, work: Path, teacher: Teacher) -> None:
+        self._teacher = teacher if isinstance(teacher, Timed) else None
+        self._unwritten = Unwritten(work / UNWRITTEN_FILE) if self._teacher else None
+        self.total = self._unwritten.lost if self._unwritten else Cost()
+
+    @property
+    def tells(self) -> bool:
+        """Whether anything was lost, or is asked for."""
+        return self._unwritten is not None and self._unwritten.tells
+
+    def add(self, spent: Cost) -> None:
+        """Add what was written down."""
+        self.total += spent
+
+    def ask(self, count: int) -> None:
+        """Keep on disk that so many decisions or lessons are asked for."""
+        if self._unwritten:
+            self._unwritten.ask(self._guess(count))
+
+    @contextmanager
+    def asked(self, count: int, known: Sequence[Decision] = ()) -> Generator[None]:
+        """Keep on disk that so many are asked for, and afterwards what was lost; `known` are made but not yet added."""
+        if not self._unwritten or not self._teacher:
+            yield
+            return
+        before = self._teacher.lost
+        self.ask(count)
+        try:
+            yield
+        finally:
+            # Told to end by a signal, it waits for nothing: that is as a kill.
+            if not isinstance(sys.exception(), TerminatedError):
+                self._unwritten.settle(self._guess(self._teacher.lost - before, known))
+
+    def record(self) -> dict[str, Any]:
+        """Return what a dataset tells of it: what was lost, if anything was."""
+        lost = self._unwritten.lost if self._unwritten else Cost()
+        return {"lost": asdict(lost)} if lost.decisions else {}
+
+    def _guess(self, count: int, more: Sequence[Decision] = ()) -> Cost:
+        """Return what so many decisions or lessons cost, by the mean of those that were made, `more` among them."""
+        of = self.total + cost_of(more)
+        share = count / max(of.decisions, 1)
+        return Cost(count, round(of.tokens * share), of.cost * share)
