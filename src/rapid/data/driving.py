@@ -155,6 +155,7 @@ class Collecting:
             decisions = journal.recall(seen)
             if decisions is None:
                 self._check_budget(len(active))
+                self.spending.get_ready()
                 keys = np.array([stream_seed(seeds[world], f"step/{step}") for world in active], np.int64)
                 decisions = self._decide(seen, [previous[world] for world in active], keys, journal)
             self._count(decisions)

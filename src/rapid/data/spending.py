@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +27,12 @@ class Spending:
     def __init__(self, work: Path, teacher: Teacher) -> None:
         self._teacher = teacher if isinstance(teacher, Timed) else None
         self._unwritten = Unwritten(work / UNWRITTEN_FILE) if self._teacher else None
-        self.total = self._unwritten.lost if self._unwritten else Cost()
+        self._ready = False
+        self.total = self._unwritten.lost + self._unwritten.greetings if self._unwritten else Cost()
 
     @property
     def tells(self) -> bool:
-        """Whether anything was lost, or is asked for."""
+        """Whether anything was paid for that is written down nowhere else, or is asked for."""
         return self._unwritten is not None and self._unwritten.tells
 
     def add(self, spent: Cost) -> None:
@@ -44,25 +44,33 @@ class Spending:
         if self._unwritten:
             self._unwritten.ask(self._guess(count))
 
+    def get_ready(self) -> None:
+        """Let the teacher look whether whoever it asks answers, before anything is driven; that is paid for, too."""
+        if self._teacher and not self._ready:
+            with self.asked(1):
+                self._teacher.get_ready()
+            self._ready = True
+
     @contextmanager
     def asked(self, count: int, known: Sequence[Decision] = ()) -> Generator[None]:
         """Keep on disk that so many are asked for, and afterwards what was lost; `known` are made but not yet added."""
         if not self._unwritten or not self._teacher:
             yield
             return
-        before = self._teacher.lost
+        before, greeted = self._teacher.lost, len(self._teacher.greetings)
         self.ask(count)
         try:
             yield
         finally:
             # Told to end by a signal, it waits for nothing: that is as a kill.
             if not isinstance(sys.exception(), TerminatedError):
-                self._unwritten.settle(self._guess(self._teacher.lost - before, known))
+                greetings = cost_of(self._teacher.greetings[greeted:])
+                self.total += greetings
+                self._unwritten.settle(self._guess(self._teacher.lost - before, known), greetings)
 
     def record(self) -> dict[str, Any]:
-        """Return what a dataset tells of it: what was lost, if anything was."""
-        lost = self._unwritten.lost if self._unwritten else Cost()
-        return {"lost": asdict(lost)} if lost.decisions else {}
+        """Return what a dataset tells of what is in none of its rows."""
+        return self._unwritten.record if self._unwritten else {}
 
     def _guess(self, count: int, more: Sequence[Decision] = ()) -> Cost:
         """Return what so many decisions or lessons cost, by the mean of those that were made, `more` among them."""

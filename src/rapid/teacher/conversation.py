@@ -86,6 +86,7 @@ class ConversingTeacher:
         self._chat, self._config, self._identity, self._lanes = chat, config, identity, lanes
         self._failures = 0
         self._greet, self._patience = greet, patience_of(chat)
+        self._greetings: list[Decision] = []
 
     def describe(self) -> dict[str, Any]:
         """Return the teacher's identity."""
@@ -112,7 +113,7 @@ class ConversingTeacher:
             InterruptedDecisions: the user interrupted.
         """
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
-        self._get_ready()
+        self.get_ready()
         start = time.perf_counter()
         decisions = self._all_of([self._decide(*given) for given in zip(all_facts, previous, strict=True)])
         if isinstance(self._chat, BatchChat):
@@ -154,15 +155,29 @@ class ConversingTeacher:
         """Wait for nothing beyond `moment`; see :class:`rapid.teacher.decision.Timed`."""
         self._patience.end_by(moment, reason)
 
-    def _get_ready(self) -> None:
-        """Before anything is driven, look whether the server is there and answers a question."""
+    @property
+    def greetings(self) -> Sequence[Decision]:
+        """Decisions that were paid for before anything was driven."""
+        return self._greetings
+
+    def get_ready(self) -> None:
+        """Look whether the server is there and answers a question; see :class:`rapid.teacher.decision.Timed`.
+
+        Raises:
+            RapidError: also if the server refuses the key or the model.
+            UnreachableError: it gives no answer.
+            StoppedError: the time set by :meth:`end_by` was over before.
+        """
         if self._greet is None:
             return
         # To its end, where it raises what broke it off.
         if list(attend([partial(_done, self._greet)], self._patience)) == [None]:
             raise StoppedError(self._patience.reason)
         facts = gather(read_scenes(np.zeros((1, 1, 5), np.float32), self._lanes)[0])
-        [decision] = self._lead([self._decide(facts, None)])
+        decision: Decision | None = None
+        for decision in self._lead([self._decide(facts, None)]):
+            if decision is not None and decision.tokens_in:
+                self._greetings.append(decision)
         if decision is None:
             raise StoppedError(self._patience.reason)
         if decision.unanswered:

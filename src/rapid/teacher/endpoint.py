@@ -210,7 +210,7 @@ class Endpoint:
     def _exchange(self, method: str, name: str, body: bytes) -> Mapping[str, Any]:
         """Make one request and return the object that came."""
         self._wait_for_slot()
-        with self.patience.flight(self._config.timeout_s) as flight:
+        with self.patience.flight(self._config.timeout_s, paid=method == "POST") as flight:
             try:
                 response = exchange(method, self._address, name, self._headers, body, flight, self._most_bytes)
             except WireError as error:
