@@ -129,20 +129,29 @@ class ConversingTeacher:
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
         """Give one experience for each episode; see :class:`rapid.teacher.memory.Reflective`."""
-        broken_off = False
+        broken_off, given_up = False, None
         lessons = [learn(episode, self._lanes, self._config, self._patience) for episode in episodes]
         # To its end, where it raises what broke it off.
         for result in self._lead(lessons):
             if result is None:
                 broken_off = True
-            elif broken_off:
-                # A memory is in the order of its episodes: what comes after a gap is asked again.
-                if result[0].tokens_in:
-                    self._patience.lose()
-            else:
-                experience, fault = result
-                self._watch(fault)
-                yield experience
+                continue
+            experience, fault = result
+            if not (broken_off or given_up):
+                try:
+                    self._watch(fault)
+                except UnreachableError as error:
+                    given_up = error
+                    # The others are let go, which counts those under way.
+                    self._patience.drop()
+                else:
+                    yield experience
+                    continue
+            # A memory is in the order of its episodes: what comes after a gap is asked again.
+            if experience.tokens_in:
+                self._patience.lose()
+        if given_up:
+            raise given_up
         if broken_off:
             raise StoppedError(self._patience.reason)
 
