@@ -19,6 +19,7 @@ from rapid.data.card import card
 from rapid.data.collection import collect
 from rapid.data.dataset import Dataset, load_dataset
 from rapid.data.driving import Budget, SpentError
+from rapid.data.fallbacks import TooManyFallbacksError
 from rapid.data.unwritten import Cost, greetings_in, lost_in
 from rapid.errors import RapidError
 from rapid.teacher.conversation import ConversingTeacher
@@ -329,3 +330,31 @@ def test_a_greeting_without_a_usable_end_is_counted_for_what_it_took(server: Ser
     server.acts = [answer(completion())]
     data = collect(driver(server, style="react", max_retries=0), SCENARIO, tmp_path, 120, 4)
     assert greetings_in(data.collection) == Cost(1, EACH, 0.0)
+
+
+def test_answers_that_are_thrown_away_since_the_rule_decides_too_often_are_counted(server: Server, tmp_path: Path):
+    """Four decisions are made and kept; from then on every answer, and its correction, is none."""
+    server.acts = [*[answer(completion("keep"))] * 4, answer(completion("I like cheese"))]
+    with pytest.raises(TooManyFallbacksError):
+        collect(driver(server), SCENARIO, tmp_path, 120, 4, budget=Budget(fallback_share=0.2))
+    thrown = len(server.requests) - 4
+    assert thrown > 0
+    assert lost_in(go_on(server, tmp_path).collection) == Cost(thrown // 2, EACH * thrown, 0.0)
+
+
+def test_turns_that_led_to_no_answer_before_the_server_was_given_up_are_counted(server: Server, tmp_path: Path):
+    """First turns are answered and second ones are not: what the rule decided so, in two steps, is asked again."""
+    call = {"id": "1", "type": "function", "function": {"name": "get_available_actions", "arguments": "{}"}}
+    first, second = answer(completion(None, tool_calls=[call])), answer({"choices": []})
+
+    def act(handler: Any, request: Any) -> None:
+        (second if request["messages"][-1]["role"] == "tool" else first)(handler, request)
+
+    server.acts = [act]
+    with pytest.raises(RapidError, match="in a row"):
+        collect(driver(server, style="react", max_retries=0), SCENARIO, tmp_path, 120, 4)
+    asked = len(server.requests) // 2
+    assert asked > 4
+    server.acts = [answer(completion())]
+    data = collect(driver(server, style="react", max_retries=0), SCENARIO, tmp_path, 120, 4)
+    assert lost_in(data.collection) == Cost(asked, EACH * asked, 0.0)

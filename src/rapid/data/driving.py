@@ -162,7 +162,7 @@ class Collecting:
             try:
                 check_share(self.fallbacks, self.decisions, self.budget.fallback_share, self.last_fallback)
             except TooManyFallbacksError:
-                journal.forget_from(is_fallback)
+                self.spending.forget(journal.forget_from(is_fallback))
                 raise
             # The actions of finished worlds are ignored.
             actions = np.full(len(seeds), IDLE, np.int64)
@@ -205,7 +205,10 @@ class Collecting:
             except (UnfinishedError, InterruptedDecisions, RefusedError, UnreachableError) as broken_off:
                 if isinstance(broken_off, UnreachableError):
                     # What the rule decided just before, while the server was already gone, is asked again.
-                    journal.forget_end(lambda decision: decision.unanswered)
+                    self.spending.forget(journal.forget_end(lambda decision: decision.unanswered))
+                self.spending.forget(
+                    [decision for decision in broken_off.decisions if decision and decision.unanswered]
+                )
                 made = [None if decision and decision.unanswered else decision for decision in broken_off.decisions]
                 raise
             finally:

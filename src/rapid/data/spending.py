@@ -68,6 +68,12 @@ class Spending:
                 self.total += greetings
                 self._unwritten.settle(self._guess(self._teacher.lost - before, known), greetings)
 
+    def forget(self, decisions: Iterable[Decision]) -> None:
+        """Count decisions as lost that were made and are asked for again, those of them that took tokens."""
+        spent = cost_of(decision for decision in decisions if decision.tokens_in)
+        if self._unwritten and spent.decisions:
+            self._unwritten.lose(spent)
+
     def record(self) -> dict[str, Any]:
         """Return what a dataset tells of what is in none of its rows."""
         return self._unwritten.record if self._unwritten else {}

@@ -106,6 +106,11 @@ class Unwritten:
         self.greetings += greetings
         self._write()
 
+    def lose(self, lost: Cost) -> None:
+        """Write down that these, which were written down, are asked for again."""
+        self.lost += lost
+        self._write()
+
     def _write(self) -> None:
         kept = {"lost": asdict(self.lost), "greetings": asdict(self.greetings), "asked": asdict(self._asked)}
         write_json(self._path, kept, sealed=True)
