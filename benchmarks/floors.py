@@ -26,8 +26,9 @@ from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import ACTIONS, PAPER_SCENARIOS
 from rapid.simulator import make_vec
-from rapid.simulator.belief import DEPTH, DRAWS, REACH
+from rapid.simulator.belief import DEPTH, DRAWS
 from rapid.simulator.compile import kernel_stamp
+from rapid.simulator.drawn import REACH
 from rapid.simulator.search import WIDTH, unavoidable
 from rapid.spawns import spawn_seeds
 

@@ -16,6 +16,7 @@ Shapes: B batch, V vehicles, F features, A actions, S entries of a state, K poin
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -121,7 +122,7 @@ class NoiseAverage(Defence):
         return obs_BVF
 
 
-class Following(Defence):
+class Following(Defence, ABC):
     """Follows cars: each is expected a second on from where it was believed to be, and believed near where it is seen.
 
     Of what is seen and what is expected, two belong together if each is the other's nearest. A car that was not
@@ -143,9 +144,9 @@ class Following(Defence):
         believed_BV4 = self.believed(obs_BVF[..., 1:], expected_BVF[..., 1:])
         return torch.cat([obs_BVF[..., :1], torch.where(known_BV[..., None], believed_BV4, obs_BVF[..., 1:])], -1)[None]
 
+    @abstractmethod
     def believed(self, seen_BV4: Tensor, expected_BV4: Tensor) -> Tensor:
         """Return places and speeds between what is seen and what was expected."""
-        raise NotImplementedError
 
     def notice(self, obs_BVF: Tensor, state_BS: Tensor) -> Tensor:
         """Return what is believed."""

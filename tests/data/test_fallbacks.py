@@ -98,7 +98,7 @@ def test_too_many_stop_the_collection_with_the_last_answer_and_why_it_was_refuse
 
 def test_a_process_that_ended_while_it_stopped_stops_again(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(Journal, "forget_from", lambda journal, unwanted: None)
+        patch.setattr(Journal, "forget_from", lambda journal, unwanted: [])
         with pytest.raises(TooManyFallbacksError):
             run(tmp_path, Unsure(every=2))
     with pytest.raises(TooManyFallbacksError, match="maybe faster"):

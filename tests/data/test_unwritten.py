@@ -19,7 +19,8 @@ from rapid.data.card import card
 from rapid.data.collection import collect
 from rapid.data.dataset import Dataset, load_dataset
 from rapid.data.driving import Budget, SpentError
-from rapid.data.unwritten import Cost, lost_in
+from rapid.data.fallbacks import TooManyFallbacksError
+from rapid.data.unwritten import Cost, greetings_in, lost_in
 from rapid.errors import RapidError
 from rapid.teacher.conversation import ConversingTeacher
 from rapid.teacher.decision import Decision
@@ -63,9 +64,10 @@ class Stuck:
             return
 
 
-def driver(server: Server, **settings: Any) -> ConversingTeacher:
+def driver(server: Server, greets: bool = False, **settings: Any) -> ConversingTeacher:
     config = TeacherConfig(backend="endpoint", model="m", base_url=server.url, api_key_env="NONE", **settings)
-    return ConversingTeacher(Endpoint(config), config, {"model": "m"}, 3)
+    endpoint = Endpoint(config)
+    return ConversingTeacher(endpoint, config, {"model": "m"}, 3, greet=endpoint.greet if greets else None)
 
 
 def go_on(server: Server, place: Path, **options: Any) -> Dataset:
@@ -238,3 +240,121 @@ def test_what_the_end_of_the_time_lets_go_is_counted_and_spent(server: Server, t
         go_on(server, tmp_path, budget=Budget(tokens=paid + 30))
     lost = lost_in(go_on(server, tmp_path).collection)
     assert (lost.decisions, lost.tokens > 0) == (3, True)
+
+
+LISTING = answer({"data": [{"id": "m"}]})
+EACH = 18
+"""Tokens of one answer."""
+
+
+def test_the_decision_that_greets_a_server_is_counted_as_spent(server: Server, tmp_path: Path):
+    prices = {"price_in": 1e6, "price_out": 0.0}  # one answer costs 11
+    server.acts = [LISTING, answer(completion("keep"))]
+    # Four worlds: their first step takes 72 tokens, and with the greeting the budget is spent.
+    with pytest.raises(SpentError, match="tokens was spent"):
+        collect(driver(server, greets=True, **prices), SCENARIO, tmp_path, 120, 4, budget=Budget(tokens=4 * EACH + 1))
+    assert len(server.requests) == 1 + 4
+    # Nobody is greeted where nothing may be spent any more.
+    with pytest.raises(SpentError, match="cost was spent"):
+        collect(driver(server, greets=True, **prices), SCENARIO, tmp_path, 120, 4, budget=Budget(cost=44.5))
+    assert len(server.requests) == 1 + 4
+    server.acts = [LISTING, answer(completion("keep"))]
+    data = collect(driver(server, greets=True, **prices), SCENARIO, tmp_path, 120, 4)
+    assert len(server.requests) == 2 + len(data)
+    assert greetings_in(data.collection) == Cost(2, 2 * EACH, 22.0)
+    assert lost_in(data.collection) == Cost()
+    assert "to see that the server answers: 2 decisions, 36 tokens, cost 22\n" in card(data)
+    # A finished collection that is extended greets again, and keeps count.
+    server.acts = [LISTING, answer(completion("keep"))]
+    more = collect(driver(server, greets=True, **prices), SCENARIO, tmp_path, 150, 4)
+    assert len(server.requests) == 3 + len(more)
+    assert greetings_in(load_dataset(tmp_path).collection).decisions == 3
+    assert "greetings" not in (go_on(server, tmp_path / "nobody").collection or {})
+
+
+def test_a_question_for_the_models_that_is_let_go_is_no_decision(server: Server, tmp_path: Path):
+    stuck = Stuck(0)
+    server.acts = [stuck]
+    with pytest.raises(SpentError, match="seconds was spent"):
+        collect(driver(server, greets=True), SCENARIO, tmp_path, 120, 4, budget=Budget(seconds=1.0))
+    assert not server.requests
+    stuck.open.set()
+    assert lost_in(go_on(server, tmp_path).collection) == Cost()
+
+
+def test_a_greeting_that_is_let_go_is_one_decision_lost(server: Server, tmp_path: Path):
+    stuck = Stuck(0)
+    server.acts = [LISTING, stuck]
+    with pytest.raises(SpentError, match="seconds was spent"):
+        collect(driver(server, greets=True), SCENARIO, tmp_path / "late", 120, 4, budget=Budget(seconds=2.0))
+    stuck.open.set()
+    assert len(server.requests) == 1
+    assert lost_in(go_on(server, tmp_path / "late").collection).decisions == 1
+
+
+def test_a_process_that_ends_while_it_greets_loses_one_decision(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    teacher = driver(server, greets=True)
+
+    def told() -> None:
+        raise StoppedError("what is done is kept")
+
+    monkeypatch.setattr(teacher, "get_ready", told)
+    with pytest.raises(StoppedError):
+        collect(teacher, SCENARIO, tmp_path, 120, 4)
+    assert lost_in(go_on(server, tmp_path).collection).decisions == 1
+
+
+def test_a_greeting_that_an_interruption_lets_end_is_spent_and_not_lost(server: Server, tmp_path: Path):
+    def act(handler: Any, request: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.5)
+        answer(completion("keep"))(handler, request)
+
+    server.acts = [LISTING, act]
+    with pytest.raises(KeyboardInterrupt):
+        collect(driver(server, greets=True), SCENARIO, tmp_path, 120, 4)
+    assert len(server.requests) == 1
+    data = go_on(server, tmp_path)
+    assert (greetings_in(data.collection), lost_in(data.collection)) == (Cost(1, EACH, 0.0), Cost())
+
+
+def test_a_greeting_without_a_usable_end_is_counted_for_what_it_took(server: Server, tmp_path: Path):
+    """In react style the first turn is answered and the second is not: nothing is driven, and 18 tokens are paid."""
+    call = {"id": "1", "type": "function", "function": {"name": "get_available_actions", "arguments": "{}"}}
+    broken = answer({"choices": []})
+    server.acts = [LISTING, answer(completion(None, tool_calls=[call])), broken]
+    with pytest.raises(RapidError, match="was asked for one decision"):
+        collect(driver(server, greets=True, style="react", max_retries=0), SCENARIO, tmp_path, 120, 4)
+    server.acts = [answer(completion())]
+    data = collect(driver(server, style="react", max_retries=0), SCENARIO, tmp_path, 120, 4)
+    assert greetings_in(data.collection) == Cost(1, EACH, 0.0)
+
+
+def test_answers_that_are_thrown_away_since_the_rule_decides_too_often_are_counted(server: Server, tmp_path: Path):
+    """Four decisions are made and kept; from then on every answer, and its correction, is none."""
+    server.acts = [*[answer(completion("keep"))] * 4, answer(completion("I like cheese"))]
+    with pytest.raises(TooManyFallbacksError):
+        collect(driver(server), SCENARIO, tmp_path, 120, 4, budget=Budget(fallback_share=0.2))
+    thrown = len(server.requests) - 4
+    assert thrown > 0
+    assert lost_in(go_on(server, tmp_path).collection) == Cost(thrown // 2, EACH * thrown, 0.0)
+
+
+def test_turns_that_led_to_no_answer_before_the_server_was_given_up_are_counted(server: Server, tmp_path: Path):
+    """First turns are answered and second ones are not: what the rule decided so, in two steps, is asked again."""
+    call = {"id": "1", "type": "function", "function": {"name": "get_available_actions", "arguments": "{}"}}
+    first, second = answer(completion(None, tool_calls=[call])), answer({"choices": []})
+
+    def act(handler: Any, request: Any) -> None:
+        (second if request["messages"][-1]["role"] == "tool" else first)(handler, request)
+
+    server.acts = [act]
+    with pytest.raises(RapidError, match="in a row"):
+        collect(driver(server, style="react", max_retries=0), SCENARIO, tmp_path, 120, 4)
+    asked = len(server.requests) // 2
+    assert asked > 4
+    server.acts = [answer(completion())]
+    data = collect(driver(server, style="react", max_retries=0), SCENARIO, tmp_path, 120, 4)
+    assert lost_in(data.collection) == Cost(asked, EACH * asked, 0.0)

@@ -12,8 +12,9 @@ from rapid.agents.open import PLANNERS, kind_of, open_agent
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.scenarios import IDLE, LANE_RIGHT, NUM_ACTIONS, NUM_FEATURES, NUM_VEHICLES, SLOWER
-from rapid.simulator import belief, make_vec
+from rapid.simulator import make_vec
 from rapid.simulator.belief import CarsPlanner, ObservationPlanner, search_belief
+from rapid.simulator.drawn import UNSEEN, from_observation, within_reach
 from rapid.simulator.search import tries_of
 from rapid.simulator.state import EXPONENT, ORDER, RANK, SPEED, TARGET_LANE, TARGET_SPEED, TIMER, X, Y
 from rapid.simulator.vector_env import CompiledVectorEnv
@@ -73,7 +74,7 @@ def test_who_knows_the_cars_does_not_know_their_drivers() -> None:
 
 def test_all_cars_that_can_matter_are_copied_and_ordered() -> None:
     env = worlds([1], "lane-3-density-2")
-    cars, tags, _ = belief._within_reach(env.state.cars[0], env.state.tags[0], env.state.world[0], 2)
+    cars, tags, _ = within_reach(env.state.cars[0], env.state.tags[0], env.state.world[0], 2)
     ahead = env.state.cars[0, X] - env.state.cars[0, X, 0]
     near = (ahead >= -60) & (ahead <= 200)
     assert NUM_VEHICLES < near.sum() < len(near), "more than an observation shows, and not all"
@@ -87,7 +88,7 @@ def test_an_observation_is_reconstructed_as_the_world_is() -> None:
     for action in (IDLE, SLOWER, LANE_RIGHT):
         obs_BVF = env.step(np.array([action]))[0]
     rng = np.random.default_rng(0)
-    cars, tags, world = belief._from_observation(obs_BVF[0].astype(float), env.settings, 2, rng)
+    cars, tags, world = from_observation(obs_BVF[0].astype(float), env.settings, 2, rng)
     true = env.state.cars[0]
     nearest = np.argsort(np.abs(true[X] - true[X, 0]), kind="stable")[:NUM_VEHICLES]
     for row, limit in ((Y, 1e-5), (SPEED, 1e-4)):
@@ -97,8 +98,8 @@ def test_an_observation_is_reconstructed_as_the_world_is() -> None:
     assert tags[0, TARGET_LANE, :NUM_VEHICLES].tolist() == env.state.tags[0, TARGET_LANE, nearest].tolist()
     assert (cars[0, TARGET_SPEED, 0], world[0, 2]) == (true[TARGET_SPEED, 0], env.state.world[0, 2])
     # What there was no room for lies beyond, on lanes, and differs from draw to draw.
-    unseen = slice(NUM_VEHICLES, NUM_VEHICLES + belief.UNSEEN)
-    assert cars.shape[2] == NUM_VEHICLES + belief.UNSEEN
+    unseen = slice(NUM_VEHICLES, NUM_VEHICLES + UNSEEN)
+    assert cars.shape[2] == NUM_VEHICLES + UNSEEN
     assert (ahead[:, unseen] >= np.abs(ahead[:, :NUM_VEHICLES]).max()).all()
     assert set(cars[:, Y, unseen].ravel()) <= {0.0, 4.0, 8.0}
     assert (ahead[0, unseen] != ahead[1, unseen]).any()
@@ -109,7 +110,7 @@ def test_no_car_is_drawn_into_another(scenario: str) -> None:
     env, rng = worlds([7], scenario), np.random.default_rng(0)
     for _ in range(4):
         obs_BVF = env.step(np.array([SLOWER]))[0]
-        cars, tags, _ = belief._from_observation(obs_BVF[0].astype(float), env.settings, 20, rng)
+        cars, tags, _ = from_observation(obs_BVF[0].astype(float), env.settings, 20, rng)
         for own_cars, own_tags in zip(cars, tags, strict=True):
             for drawn in range(NUM_VEHICLES, own_cars.shape[1]):
                 same_lane = own_tags[TARGET_LANE] == own_tags[TARGET_LANE, drawn]
@@ -120,7 +121,7 @@ def test_no_car_is_drawn_into_another(scenario: str) -> None:
 def test_nothing_is_invented_where_everything_is_seen() -> None:
     obs_VF = np.zeros((NUM_VEHICLES, NUM_FEATURES))
     obs_VF[:2] = [1, 100, 4, 25, 0], [1, 150, 4, 20, 0]
-    cars, _, _ = belief._from_observation(obs_VF, worlds([0]).settings, 3, np.random.default_rng(0))
+    cars, _, _ = from_observation(obs_VF, worlds([0]).settings, 3, np.random.default_rng(0))
     assert cars.shape == (3, 15, 2)
 
 

@@ -2,13 +2,16 @@
 
 import contextlib
 import itertools
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from fake_server import Server, answer, completion
@@ -17,9 +20,11 @@ from rapid.data.collection import collect
 from rapid.data.dataset import load_dataset
 from rapid.data.driving import Budget, SpentError
 from rapid.teacher.chat import Chat, attend, converse
-from rapid.teacher.conversation import ConversingTeacher
-from rapid.teacher.decision import InterruptedDecisions, UnfinishedError
+from rapid.teacher.conversation import FAILURES_IN_A_ROW, ConversingTeacher
+from rapid.teacher.decision import Decision, InterruptedDecisions, UnfinishedError, UnreachableError
 from rapid.teacher.endpoint import Endpoint
+from rapid.teacher.experience import Experience
+from rapid.teacher.memory import Episode
 from rapid.teacher.patience import Patience, StoppedError
 
 
@@ -208,6 +213,41 @@ def test_an_interrupted_step_goes_on_where_it_was(server, tmp_path):
     server.acts = [answer(completion("keep"))]
     collect(driver(server), "lane-3-density-2-fast", tmp_path, 60, 4)
     assert len(server.requests) == load_dataset(tmp_path).log.num_rows
+
+
+def test_lessons_that_come_after_a_server_was_given_up_are_counted_as_lost(server, world):
+    """Those of two of the crashes were answered meanwhile, and one is under way: all three are asked again."""
+    first = FAILURES_IN_A_ROW
+    answered = threading.Barrier(first + 2)
+    slow = Slow(0, 15)
+
+    def act(handler, request) -> None:
+        found = re.search(r"crash number (\d+)", json.dumps(request))
+        assert found
+        number = int(found[1])
+        if number < first:
+            answered.wait(30)
+            time.sleep(0.3)
+            answer({"choices": []})(handler, request)
+        elif number == first + 1:
+            slow(handler, request)
+        else:
+            answer(completion('{"lesson": "brake", "action": "slower"}'))(handler, request)
+            answered.wait(30)
+
+    server.acts = [act]
+    obs_TVF = np.concatenate([world(cars=((30, 1, 14),))] * 2)
+    crashes = [
+        Episode(obs_TVF, [Decision(1), Decision(1, f"crash number {number}", status="ok")], True, number)
+        for number in range(first + 3)
+    ]
+    teacher, known = driver(server, reflect=True), list[Experience]()
+    with pytest.raises(UnreachableError, match="failed 5 decisions in a row"):
+        known.extend(teacher.look_back(crashes))
+    slow.open.set()
+    assert [past.spawn_seed for past in known] == list(range(first - 1))
+    assert len(server.requests) == len(crashes)
+    assert teacher.lost == 3
 
 
 class Script:

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from rapid.scenarios import NUM_ACTIONS, NUM_FEATURES
+
 OPSET, IR_VERSION = 17, 8
 Array = NDArray[np.float32]
 
@@ -55,6 +57,29 @@ class Graph:
     def norm(self, rows: str, layer: nn.LayerNorm) -> str:
         """Return the rows normalised."""
         return self.node("LayerNormalization", rows, array(layer.weight), array(layer.bias), axis=-1, epsilon=layer.eps)
+
+    def model(self, state_size: int = 0) -> Any:
+        """Return the `onnx.ModelProto` of the nodes so far, checked: from `obs` (B, V, F) to `q` (B, A).
+
+        With a state of some size S it also reads `state` (B, S) and gives `next_state`. All of these are names that
+        the nodes must use.
+        """
+        kind, onnx = self._onnx.TensorProto.FLOAT, self._onnx
+        inputs, outputs = {"obs": (self.vehicles, NUM_FEATURES)}, {"q": (NUM_ACTIONS,)}
+        if state_size:
+            inputs, outputs = {**inputs, "state": (state_size,)}, {**outputs, "next_state": (state_size,)}
+        given, made = (
+            [onnx.helper.make_tensor_value_info(name, kind, ["batch", *shape]) for name, shape in side.items()]
+            for side in (inputs, outputs)
+        )
+        model = onnx.helper.make_model(
+            onnx.helper.make_graph(self.nodes, "rapid", given, made, self.constants),
+            opset_imports=[onnx.helper.make_opsetid("", OPSET)],
+            ir_version=IR_VERSION,
+            producer_name="rapid",
+        )
+        onnx.checker.check_model(model, full_check=True)
+        return model
 
 
 def array(tensor: Tensor) -> Array:

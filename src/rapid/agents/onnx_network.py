@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from rapid.agents.onnx_arrays import Arrays
-from rapid.agents.onnx_graph import IR_VERSION, OPSET, Array, Graph, array
+from rapid.agents.onnx_graph import Array, Graph, array
 from rapid.agents.onnx_memory import Names, believed, next_state, recalled
 from rapid.agents.onnx_transformer import first_of_block, through_block, through_transformer
 from rapid.networks.blocks import Block
@@ -44,25 +44,7 @@ def build_model(network: QNetwork) -> Any:
     if memory is not None:
         next_state(graph, memory, "state", "q")
         graph.nodes[-1].output[0] = "next_state"
-    kind, make = onnx.TensorProto.FLOAT, onnx.helper.make_tensor_value_info
-    state = (kind, ["batch", STATE_SIZE])
-    model = onnx.helper.make_model(
-        onnx.helper.make_graph(
-            graph.nodes,
-            "rapid",
-            [
-                make("obs", kind, ["batch", graph.vehicles, NUM_FEATURES]),
-                *([] if memory is None else [make("state", *state)]),
-            ],
-            [make("q", kind, ["batch", NUM_ACTIONS]), *([] if memory is None else [make("next_state", *state)])],
-            graph.constants,
-        ),
-        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="rapid",
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return model
+    return graph.model(0 if memory is None else STATE_SIZE)
 
 
 def _q_values(graph: Graph, network: QNetwork) -> str:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rapid import files
 from rapid.agents.onnx import METADATA_KEY, TOLERANCE, OnnxAgent, Parity
-from rapid.agents.onnx_graph import IR_VERSION, OPSET, Graph
+from rapid.agents.onnx_graph import Graph
 from rapid.errors import RapidError
 from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, NUM_ACTIONS, NUM_FEATURES, Scenario, get_task
 
@@ -221,21 +221,7 @@ def _build(onnx: Any, policy: Sb3Policy, looks: _Observation) -> Any:
         rows = graph.node("Gemm", rows, weight.T, bias)
         rows = graph.node(policy.activation, rows) if index < len(policy.layers) - 1 else rows
     graph.nodes[-1].output[0] = "q"
-    kind, make = onnx.TensorProto.FLOAT, onnx.helper.make_tensor_value_info
-    model = onnx.helper.make_model(
-        onnx.helper.make_graph(
-            graph.nodes,
-            "rapid",
-            [make("obs", kind, ["batch", looks.vehicles, NUM_FEATURES])],
-            [make("q", kind, ["batch", NUM_ACTIONS])],
-            graph.constants,
-        ),
-        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="rapid",
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return model
+    return graph.model()
 
 
 def _look(graph: Graph, looks: _Observation) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 from rapid.data.dataset import LICENCE, Dataset, summary
 from rapid.data.fallbacks import fallback_notice
 from rapid.data.transitions import SOURCES
-from rapid.data.unwritten import lost_in
+from rapid.data.unwritten import greetings_in, lost_in
 from rapid.scenarios import get_scenario
 from rapid.text import in_markdown, printable
 
@@ -56,6 +56,8 @@ def card(dataset: Dataset) -> str:
         lines += ["", "## Decisions", "", *_decision_lines(facts["decisions"], len(dataset))]
         if (lost := lost_in(dataset.collection)).decisions:
             lines.append(f"- Asked for and lost when processes ended: {lost}")
+        if (asked := greetings_in(dataset.collection)).decisions:
+            lines.append(f"- Asked for before driving, to see that the server answers: {asked.exactly}")
     if "memory" in facts:
         lines += ["", "## Memory", "", *_memory_lines(facts["memory"])]
     lines += ["", "## Drivers"]

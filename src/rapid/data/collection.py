@@ -23,7 +23,7 @@ from rapid.data.driving import JOURNAL_FILE, Collecting, MakeWorlds
 from rapid.data.journal import check_settings, check_unclaimed
 from rapid.data.parts import LIST_FILE
 from rapid.data.tables import PART_SCHEMA, to_table, write_parquet
-from rapid.data.unwritten import UNWRITTEN_FILE
+from rapid.data.unwritten import UNWRITTEN_FILE, reopen
 from rapid.errors import RapidError
 from rapid.files import make_directory, read_json, remove_leftovers, write_json, write_text
 from rapid.locks import LOCK_FILE, exclusive
@@ -188,8 +188,7 @@ def _reopen(dataset: Dataset, work: Path) -> None:
     for field in PART_SCHEMA:
         if field.name not in table.column_names:
             table = table.append_column(field, dataset.log.column(field.name))
-    if lost := (dataset.collection or {}).get("lost"):
-        write_json(work / UNWRITTEN_FILE, {"lost": lost, "asked": {}}, sealed=True)
+    reopen(work / UNWRITTEN_FILE, dataset.collection)
     if dataset.memory is not None:
         # First: an episode in a part that is not in the memory would be looked back on again.
         write_text(work / MEMORY_FILE, to_lines(dataset.memory[dataset.known :]))

@@ -1,11 +1,8 @@
 """Driving groups of episodes side by side: every decision goes to the journal before it acts."""
 
 import math
-import sys
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +16,10 @@ from rapid.data.fallbacks import TooManyFallbacksError, check_share, is_fallback
 from rapid.data.hindsight import Hindsight
 from rapid.data.journal import Journal
 from rapid.data.parts import Parts
+from rapid.data.spending import Spending, cost_of
 from rapid.data.tables import LOG_SCHEMA, PART_SCHEMA, TRANSITION_SCHEMA, from_table, to_table
 from rapid.data.transitions import SOURCES, Transitions
-from rapid.data.unwritten import UNWRITTEN_FILE, Cost, Unwritten
+from rapid.data.unwritten import Cost
 from rapid.errors import RapidError
 from rapid.progress import Task
 from rapid.scenarios import IDLE, NUM_ACTIONS, get_scenario
@@ -35,9 +33,8 @@ from rapid.teacher.decision import (
     UnfinishedError,
     UnreachableError,
 )
-from rapid.teacher.experience import MEMORY_FILE, Experience
+from rapid.teacher.experience import MEMORY_FILE
 from rapid.teacher.patience import StoppedError
-from rapid.termination import StoppedError as TerminatedError
 
 MakeWorlds = Callable[[int], Any]
 """Gives a vector environment of so many worlds, in which a finished world waits for the others."""
@@ -63,18 +60,13 @@ class Collecting:
         self.parts = Parts(work, seeds)
         self.count = sum(part.num_rows for part in self.parts.present)
         self.fresh, self.decisions = 0, self.count
-        self.tokens = int(sum(self._sum(name) for name in ("tokens_in", "tokens_out")))
-        self.cost = self._sum("cost")
+        self.spending = Spending(work, teacher)
+        tokens = int(sum(self._sum(name) for name in ("tokens_in", "tokens_out")))
+        self.spending.add(Cost(self.count, tokens, self._sum("cost")))
         self.fallbacks = sum(part.column("status").to_pylist().count("fallback") for part in self.parts.present)
         self.last_fallback: Decision | None = None
         self.hindsight, self.looked_back = Hindsight(work / MEMORY_FILE, teacher), 0
-        for experience in self.hindsight.experiences:
-            self._charge(experience)
-        # Of a teacher that waits for others.
-        self.unwritten = Unwritten(work / UNWRITTEN_FILE) if isinstance(teacher, Timed) else None
-        if self.unwritten:
-            self.tokens += self.unwritten.lost.tokens
-            self.cost += self.unwritten.lost.cost
+        self.spending.add(cost_of(self.hindsight.experiences))
         self.start = time.monotonic()
         if budget.seconds and isinstance(teacher, Timed):
             teacher.end_by(self.start + budget.seconds, f"The budget of {budget.seconds:g} seconds was spent")
@@ -85,8 +77,8 @@ class Collecting:
     def begun(self) -> bool:
         """Whether there is anything to go on from, or to tell of."""
         journals = (path.read_bytes().count(b"\n") for path in self.work.glob("journal*.jsonl"))
-        lost = self.unwritten is not None and self.unwritten.tells
-        return bool(len(self.parts) or self.hindsight.experiences or lost or max(journals, default=0) > 1)
+        kept = len(self.parts) or self.hindsight.experiences or max(journals, default=0) > 1
+        return bool(kept) or self.spending.tells
 
     def collect_until(self, target: int | None, lockstep: int, make_worlds: MakeWorlds) -> str:
         """Drive groups until there are `target` transitions, or from all seeds; return the budget spent, or nothing."""
@@ -163,13 +155,14 @@ class Collecting:
             decisions = journal.recall(seen)
             if decisions is None:
                 self._check_budget(len(active))
+                self.spending.get_ready()
                 keys = np.array([stream_seed(seeds[world], f"step/{step}") for world in active], np.int64)
                 decisions = self._decide(seen, [previous[world] for world in active], keys, journal)
             self._count(decisions)
             try:
                 check_share(self.fallbacks, self.decisions, self.budget.fallback_share, self.last_fallback)
             except TooManyFallbacksError:
-                journal.forget_from(is_fallback)
+                self.spending.forget(journal.forget_from(is_fallback))
                 raise
             # The actions of finished worlds are ignored.
             actions = np.full(len(seeds), IDLE, np.int64)
@@ -206,13 +199,16 @@ class Collecting:
         decisions = journal.kept(len(seen))
         wanted = [place for place, decision in enumerate(decisions) if decision is None]
         made: Sequence[Decision | None] = []
-        with self._asked(len(wanted), known := list[Decision]()):
+        with self.spending.asked(len(wanted), known := list[Decision]()):
             try:
                 made = self.teacher.decide(seen[wanted], [previous[place] for place in wanted], keys[wanted])
             except (UnfinishedError, InterruptedDecisions, RefusedError, UnreachableError) as broken_off:
                 if isinstance(broken_off, UnreachableError):
                     # What the rule decided just before, while the server was already gone, is asked again.
-                    journal.forget_end(lambda decision: decision.unanswered)
+                    self.spending.forget(journal.forget_end(lambda decision: decision.unanswered))
+                self.spending.forget(
+                    [decision for decision in broken_off.decisions if decision and decision.unanswered]
+                )
                 made = [None if decision and decision.unanswered else decision for decision in broken_off.decisions]
                 raise
             finally:
@@ -224,29 +220,6 @@ class Collecting:
                     self.fresh += len(known)
         return [decision for decision in decisions if decision is not None]
 
-    @contextmanager
-    def _asked(self, count: int, known: Sequence[Decision] = ()) -> Generator[None]:
-        """Keep on disk that so many decisions are asked for, and afterwards what was lost; `known` are those made."""
-        if not self.unwritten or not isinstance(self.teacher, Timed):
-            yield
-            return
-        before = self.teacher.lost
-        self.unwritten.ask(self._guess(count))
-        try:
-            yield
-        finally:
-            # Told to end by a signal, it waits for nothing: that is as a kill.
-            if not isinstance(sys.exception(), TerminatedError):
-                self.unwritten.settle(self._guess(self.teacher.lost - before, known))
-
-    def _guess(self, count: int, more: Sequence[Decision] = ()) -> Cost:
-        """Return what so many decisions or lessons cost, by the mean of those that were made, `more` among them."""
-        looked_back = sum(experience.tokens_in > 0 for experience in self.hindsight.experiences)
-        lost = self.unwritten.lost.decisions if self.unwritten else 0
-        share = count / max(self.decisions + looked_back + lost + len(more), 1)
-        tokens = self.tokens + sum(decision.tokens_in + decision.tokens_out for decision in more)
-        return Cost(count, round(tokens * share), (self.cost + sum(decision.cost for decision in more)) * share)
-
     def _look_back(self) -> None:
         """Let a teacher that reflects learn from the finished episodes, once from each."""
         while self.looked_back < len(self.parts):
@@ -254,17 +227,13 @@ class Collecting:
             if part is not None and (episodes := self.hindsight.pending(part)):
                 self._check_budget(0)
                 left = sum(episode.crashed for episode in episodes)  # only a crash is asked about
-                with self._asked(left):
+                with self.spending.asked(left):
                     for experience in self.hindsight.look_back(episodes):
-                        self._charge(experience)
-                        if experience.tokens_in and self.unwritten:
+                        self.spending.add(cost_of([experience]))
+                        if experience.tokens_in:
                             left -= 1
-                            self.unwritten.ask(self._guess(left))
+                            self.spending.ask(left)
             self.looked_back += 1
-
-    def _charge(self, experience: Experience) -> None:
-        self.tokens += experience.tokens_in + experience.tokens_out
-        self.cost += experience.cost
 
     def _table(self, steps: list[dict[str, Any]], seeds: list[int], first: int) -> pa.Table:
         """Return the steps of a group as a table of `PART_SCHEMA`."""
@@ -293,13 +262,12 @@ class Collecting:
     def dataset(self, complete: bool) -> Dataset:
         """Return everything collected so far as a dataset."""
         table = pa.concat_tables([PART_SCHEMA.empty_table(), *self.parts.leading])
-        lost = {"lost": asdict(self.unwritten.lost)} if self.unwritten and self.unwritten.lost.decisions else {}
         return Dataset(
             scenario=self.settings["scenario"],
             transitions=from_table(table),
             drivers={self.settings["source"]: self.settings["driver"]},
             log=table.select(LOG_SCHEMA.names).combine_chunks(),
-            collection={"complete": complete, "settings": self.settings, **lost},
+            collection={"complete": complete, "settings": self.settings, **self.spending.record()},
             memory=self.hindsight.memory,
         )
 
@@ -309,19 +277,18 @@ class Collecting:
     def _count(self, decisions: Sequence[Decision]) -> None:
         """Add to the totals."""
         self.decisions += len(decisions)
-        self.tokens += sum(decision.tokens_in + decision.tokens_out for decision in decisions)
-        self.cost += sum(decision.cost for decision in decisions)
+        self.spending.add(cost_of(decisions))
         for decision in filter(is_fallback, decisions):
             self.fallbacks, self.last_fallback = self.fallbacks + 1, decision
 
     def _check_budget(self, coming: int) -> None:
         """Raise if the budget is spent, or does not allow for the decisions that come next."""
         seconds = time.monotonic() - self.start
-        self.budget.check(self.decisions + coming, self.tokens, self.cost, seconds)
+        self.budget.check(self.decisions + coming, self.spending.total.tokens, self.spending.total.cost, seconds)
 
     def _show(self, count: int) -> None:
         rate = self.fresh / max(time.monotonic() - self.start, 1e-9)
-        tally = Tally(self.decisions, self.fresh, rate, self.cost, self.fallbacks)
+        tally = Tally(self.decisions, self.fresh, rate, self.spending.total.cost, self.fallbacks)
         if self.watch:
             self.watch(tally)
         if self.progress:

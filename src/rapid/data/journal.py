@@ -97,25 +97,26 @@ class Journal:
         # What the system holds outlives the process; only a power cut could take it. Sync what took long to get.
         self._write(record, sync=sum(decision.seconds for decision in made) > _SYNC_AFTER_SECONDS)
 
-    def forget_from(self, unwanted: Callable[[Decision], bool]) -> None:
-        """Remove the first step with an unwanted decision and all steps after it: they are decided anew."""
+    def forget_from(self, unwanted: Callable[[Decision], bool]) -> list[Decision]:
+        """Remove the first step with an unwanted decision and all steps after it, to be decided anew; return them."""
         steps = [any(map(unwanted, self._decisions(line))) for line in self._lines[1:]]
-        if True in steps:
-            self._keep(1 + steps.index(True))
+        return self._keep(1 + steps.index(True)) if True in steps else []
 
-    def forget_end(self, unwanted: Callable[[Decision], bool]) -> None:
-        """Remove the steps at the end of which the last decision is unwanted."""
+    def forget_end(self, unwanted: Callable[[Decision], bool]) -> list[Decision]:
+        """Remove the steps at the end of which the last decision is unwanted, and return what was decided in them."""
         count = len(self._lines)
         while count > 1 and any(map(unwanted, self._decisions(self._lines[count - 1])[-1:])):
             count -= 1
-        self._keep(count)
+        return self._keep(count)
 
-    def _keep(self, count: int) -> None:
-        """Remove all lines but the first `count`."""
+    def _keep(self, count: int) -> list[Decision]:
+        """Remove all lines but the first `count`; return the decisions in the others."""
+        removed = [decision for line in self._lines[count:] for decision in self._decisions(line)]
         lines = self.path.read_bytes().splitlines(keepends=True)
         truncate(self.path, sum(map(len, lines[:count])))
         del self._lines[count:]
         self._next = min(self._next, count)
+        return removed
 
     @staticmethod
     def _decisions(line: dict[str, Any]) -> list[Decision]:

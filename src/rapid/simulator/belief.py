@@ -20,16 +20,16 @@ from rapid.agents.watchable import Watchable
 from rapid.errors import RapidError
 from rapid.scenarios import FEATURES, NUM_FEATURES, NUM_VEHICLES, Scenario, get_scenario
 from rapid.simulator.compile import kernel
-from rapid.simulator.observation import INFO_COLUMNS, SIGHT
-from rapid.simulator.reconstruct import LATERAL_TIME, closeness, reconstruct
+from rapid.simulator.drawn import Worlds, from_observation, within_reach
+from rapid.simulator.observation import INFO_COLUMNS
+from rapid.simulator.reconstruct import closeness
 from rapid.simulator.search import compiled_worlds, have_ended, tries_of
 from rapid.simulator.search_kernels import distinct, select
 from rapid.simulator.settings import Settings, read_settings
-from rapid.simulator.spawn import LANE_WIDTH, TRAFFIC_START_SPEED, nearest_speed_index
+from rapid.simulator.spawn import TRAFFIC_START_SPEED, nearest_speed_index
 from rapid.simulator.state import (
     CAR_ROWS,
     EXPONENT,
-    ORDER,
     RANK,
     SPEED,
     TAG_ROWS,
@@ -40,9 +40,6 @@ from rapid.simulator.state import (
     X,
 )
 from rapid.simulator.step import step_world
-
-Worlds = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]
-"""Cars (K, CAR_ROWS, N), tags (K, TAG_ROWS, N) and the rest (K, WORLD_ENTRIES) of K worlds."""
 
 DRAWS = 6
 """Worlds drawn per decision; 16 were measured to gain nothing."""
@@ -57,16 +54,6 @@ FRAMES = 5
 and pay only where the state is exact."""
 CLOSENESS = 0.5
 """What the closest distance costs the planner that has an observation alone, in rewards per second."""
-REACH = (-60.0, 200.0)
-"""Metres from the ego, behind and ahead, beyond which cars are left out to save time; few could matter in `DEPTH`
-seconds."""
-UNSEEN = 12
-"""Cars drawn ahead of the farthest one seen, where the observation has no room for more."""
-
-_GAPS = (0.9, 1.1)
-"""Between which the gaps of unseen traffic lie, in mean gaps: as it is spawned."""
-_ROOM = 10.0
-"""Metres from one car's centre to the next on a lane of unseen traffic, at least."""
 EXPONENTS = (3.5, 4.5)
 """Between which highway-env draws the exponent of its driver model."""
 
@@ -210,17 +197,17 @@ class ObservationPlanner(Watchable):
         actions = np.zeros(len(obs_BVF), np.int64)
         for i, obs_VF in enumerate(seen_BVF):
             rng = np.random.default_rng((self._seed, zlib.crc32(obs_VF.tobytes())))
-            worlds = _from_observation(obs_VF.astype(np.float64), self._settings, self._effort.draws, rng)
+            worlds = from_observation(obs_VF.astype(np.float64), self._settings, self._effort.draws, rng)
             actions[i] = _decide(worlds, self._settings, self._effort, CLOSENESS, rng)
         return actions
 
 
 class CarsPlanner(Watchable):
-    """Knows where every car within `REACH` is, how fast, and which lane it heads for; what its driver wants is drawn.
+    """Knows where every near car is, how fast, and which lane it heads for; what its driver wants is drawn.
 
-    It stands between :class:`ObservationPlanner` and the planner of :mod:`rapid.simulator.search`, but does not differ
-    from them in knowledge alone: closeness costs it nothing, and it does not look to the end. See the former for the
-    arguments and what is raised. Give it to
+    Near is within :data:`rapid.simulator.drawn.REACH`. It stands between :class:`ObservationPlanner` and the planner
+    of :mod:`rapid.simulator.search`, but does not differ from them in knowledge alone: closeness costs it nothing, and
+    it does not look to the end. See the former for the arguments and what is raised. Give it to
     :func:`rapid.evaluation.rollouts.run_episodes`, or call :meth:`bind`.
     """
 
@@ -257,7 +244,7 @@ class BoundCarsPlanner:
         actions = np.zeros(len(state.world), np.int64)
         for i in np.flatnonzero(~have_ended(state)):
             rng = np.random.default_rng((self._agent.seed, zlib.crc32(state.cars[i, X].tobytes())))
-            worlds = _within_reach(state.cars[i], state.tags[i], state.world[i], effort.draws)
+            worlds = within_reach(state.cars[i], state.tags[i], state.world[i], effort.draws)
             actions[i] = _decide(worlds, self._settings, effort, 0.0, rng)
         return actions
 
@@ -289,63 +276,3 @@ def _decide(worlds: Worlds, settings: Settings, effort: _Effort, caution: float,
     tries, values = tries_of(settings), np.empty(len(settings.actions))
     search_belief(cars, tags, world, tries, settings, effort.width, effort.depth, caution, CRASH, values)
     return int(tries[np.argmax(values[tries])])
-
-
-def _within_reach(cars: NDArray[np.float64], tags: NDArray[np.int64], world: NDArray[np.float64], draws: int) -> Worlds:
-    """Return copies of one world, as many as are drawn, without the cars out of `REACH`."""
-    ahead = cars[X] - cars[X, 0]
-    near = np.flatnonzero((ahead >= REACH[0]) & (ahead <= REACH[1]))
-    own_cars, own_tags = cars[:, near], tags[:, near]
-    own_tags[ORDER] = np.argsort(own_cars[X], kind="stable")
-    own_tags[RANK, own_tags[ORDER]] = np.arange(len(near))
-    return tuple(np.repeat(part[None], draws, 0) for part in (own_cars, own_tags, world))  # type: ignore[return-value]
-
-
-def _from_observation(obs_VF: NDArray[np.float64], settings: Settings, draws: int, rng: np.random.Generator) -> Worlds:
-    """Return worlds as one observation shows them; traffic beyond what it has room for is drawn in each."""
-    rows_VF = obs_VF[_believed(obs_VF)]
-    seen_V5 = np.empty((len(rows_VF), 5))
-    seen_V5[:, 0] = rows_VF[:, 1] - rows_VF[0, 1]
-    seen_V5[:, 1:4] = rows_VF[:, 2:5]
-    aimed_V = np.rint((rows_VF[:, 2] + LATERAL_TIME * rows_VF[:, 4]) / LANE_WIDTH)
-    seen_V5[:, 4] = aimed_V.clip(0, settings.lanes - 1)
-    unseen = UNSEEN if len(rows_VF) == len(obs_VF) else 0
-    vehicles = len(seen_V5) + unseen
-    cars, tags = np.zeros((draws, CAR_ROWS, vehicles)), np.zeros((draws, TAG_ROWS, vehicles), np.int64)
-    world = np.zeros((draws, WORLD_ENTRIES))
-    for k in range(draws):
-        rows = np.concatenate([seen_V5, _unseen(seen_V5[1:], unseen, settings, rng)])
-        reconstruct(rows, settings, cars[k], tags[k], world[k])
-    return cars, tags, world
-
-
-def _believed(obs_VF: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which rows count as cars, the ego always: those present, and no farther off than cars are shown."""
-    believed_V = (obs_VF[:, 0] >= 0.5) & (np.abs(obs_VF[:, 1] - obs_VF[0, 1]) <= SIGHT)
-    believed_V[0] = True
-    return believed_V
-
-
-def _unseen(seen_V5: NDArray[np.float64], count: int, settings: Settings, rng: np.random.Generator) -> Any:
-    """Return traffic beyond the cars seen, as dense as it is spawned and as fast as that seen ahead.
-
-    Each next car takes a lane at random of those where there is room behind it.
-    """
-    rows = np.zeros((count, 5))
-    if count:
-        farthest = np.abs(seen_V5[:, 0]).max()
-        ahead = seen_V5[seen_V5[:, 0] > 0] if (seen_V5[:, 0] > 0).any() else seen_V5
-        mean, spread = ahead[:, 2].mean(), max(ahead[:, 2].std(), 1.0)
-        gap = settings.traffic_spacing * (12.0 + sum(TRAFFIC_START_SPEED) / 2) * settings.spacing_factor
-        rows[:, 0] = farthest + np.cumsum(gap * rng.uniform(*_GAPS, count)) - gap * rng.random()
-        last = np.full(settings.lanes, -np.inf)
-        for row in seen_V5:
-            last[int(row[4])] = max(last[int(row[4])], row[0])
-        for row in rows:
-            free = np.flatnonzero(last <= row[0] - _ROOM)
-            lane = rng.choice(free) if len(free) else np.argmin(last)
-            row[0] = max(row[0], last[lane] + _ROOM)
-            row[4], last[lane] = lane, row[0]
-        rows[:, 1] = LANE_WIDTH * rows[:, 4]
-        rows[:, 2] = rng.normal(mean, spread, count).clip(5.0, TRAFFIC_START_SPEED[1])
-    return rows

@@ -11,16 +11,7 @@ from rapid.errors import RapidError
 from rapid.scenarios import ACTIONS, IDLE, Scenario
 from rapid.simulator import startup
 from rapid.simulator.configuration import Configuration, split_options
-from rapid.simulator.observation import (
-    INFO_COLLISION,
-    INFO_CRASHED,
-    INFO_DISTANCE,
-    INFO_FAST,
-    INFO_LANE,
-    INFO_ON_ROAD,
-    INFO_RIGHT,
-    INFO_SPEED,
-)
+from rapid.simulator.info import info_of
 from rapid.simulator.render import RENDER_MODES, Frame, Window, draw
 from rapid.simulator.settings import Settings
 from rapid.simulator.state import Snapshot, State, allocate, restore, snapshot
@@ -309,23 +300,6 @@ def check_actions(actions: Any, settings: Settings, shape: tuple[int | None, ...
         named = ", ".join(f"{i} {ACTIONS[meta]}" for i, meta in enumerate(settings.actions))
         raise RapidError(f"Unknown action {wrong}; expected one of: {named}.")
     return np.ascontiguousarray(array, np.int64)
-
-
-def info_of(info: NDArray[np.float64]) -> dict[str, Any]:
-    """Return the info dict of one world from its row of INFO_COLUMNS numbers."""
-    values = info.tolist()
-    return {
-        "speed": values[INFO_SPEED],
-        "lane": int(values[INFO_LANE]),
-        "distance": values[INFO_DISTANCE],
-        "crashed": values[INFO_CRASHED] != 0.0,
-        "rewards": {
-            "collision_reward": values[INFO_COLLISION],
-            "right_lane_reward": values[INFO_RIGHT],
-            "high_speed_reward": values[INFO_FAST],
-            "on_road_reward": values[INFO_ON_ROAD],
-        },
-    }
 
 
 def forecast(state: State, actions: NDArray[np.int64], settings: Settings) -> Forecast:

@@ -13,16 +13,7 @@ from rapid.errors import RapidError
 from rapid.scenarios import Scenario
 from rapid.simulator.configuration import Configuration, split_options
 from rapid.simulator.env import Forecast, check_actions, check_render_mode, forecast, spaces_of
-from rapid.simulator.observation import (
-    INFO_COLLISION,
-    INFO_CRASHED,
-    INFO_DISTANCE,
-    INFO_FAST,
-    INFO_LANE,
-    INFO_ON_ROAD,
-    INFO_RIGHT,
-    INFO_SPEED,
-)
+from rapid.simulator.info import Mask, acted, info_of_all
 from rapid.simulator.pool import WorldPool
 from rapid.simulator.render import Frame, draw
 from rapid.simulator.settings import read_integer
@@ -30,7 +21,6 @@ from rapid.simulator.state import TERMINATED, TRUNCATED, Snapshot, State, alloca
 from rapid.simulator.step import AUTORESET, FREEZE, allocate_outputs, reset_worlds, seed_worlds, step_worlds
 from rapid.simulator.stream import stream_of
 
-Mask = NDArray[np.bool_]
 RENDERED = 16
 """Worlds that are drawn at most."""
 
@@ -152,7 +142,7 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
         reset_worlds(self.state, chosen, self.settings, out)
         self._ready |= chosen
         self._observations = out.observations
-        return out.observations.copy(), _info(out.info, chosen)
+        return out.observations.copy(), info_of_all(out.info, chosen)
 
     def step(
         self, actions: NDArray[np.integer] | Sequence[int]
@@ -180,11 +170,11 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
             info = {
                 "final_obs": finals,
                 "_final_obs": ended.copy(),
-                "final_info": _info(out.final_info, ended) | _acted(checked, ended),
+                "final_info": info_of_all(out.final_info, ended) | acted(checked, ended),
                 "_final_info": ended.copy(),
             }
-        acted = ~ended if self._mode == AUTORESET else ~still
-        info |= _info(out.info, np.ones(self.num_envs, np.bool_)) | _acted(checked, acted)
+        took = ~ended if self._mode == AUTORESET else ~still
+        info |= info_of_all(out.info, np.ones(self.num_envs, np.bool_)) | acted(checked, took)
         self._observations = out.observations
         return out.observations.copy(), out.rewards, out.terminated, out.truncated, info
 
@@ -322,37 +312,3 @@ class CompiledVectorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray[
     def _require_reset(self) -> None:
         if not self._ready.all():
             raise RapidError("No episode has begun in some worlds. Call reset() first.")
-
-
-def _acted(actions: NDArray[np.int64], mask: Mask) -> dict[str, Any]:
-    return {"action": np.where(mask, actions, 0), "_action": mask} if mask.any() else {}
-
-
-def _info(info: NDArray[np.float64], mask: Mask) -> dict[str, Any]:
-    """Return the (B, INFO_COLUMNS) numbers as Gymnasium's vector info, valid where `mask` holds and zero elsewhere."""
-    columns = np.where(mask[:, None], info, 0.0).T
-
-    def masked(entries: dict[str, Any]) -> dict[str, Any]:
-        result: dict[str, Any] = {}
-        for key, value in entries.items():
-            result[key] = value
-            result["_" + key] = mask.copy()
-        return result
-
-    terms = masked(
-        {
-            "collision_reward": columns[INFO_COLLISION],
-            "right_lane_reward": columns[INFO_RIGHT],
-            "high_speed_reward": columns[INFO_FAST],
-            "on_road_reward": columns[INFO_ON_ROAD],
-        }
-    )
-    return masked(
-        {
-            "speed": columns[INFO_SPEED],
-            "lane": columns[INFO_LANE].astype(np.int64),
-            "distance": columns[INFO_DISTANCE],
-            "crashed": columns[INFO_CRASHED] != 0.0,
-            "rewards": terms,
-        }
-    )

@@ -10,7 +10,6 @@ import dataclasses
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar
 
@@ -29,9 +28,7 @@ from rapid.teacher.chat import (
     Chat,
     ChatError,
     Conversation,
-    Message,
     Reply,
-    Request,
     attend,
     converse,
     patience_of,
@@ -46,19 +43,14 @@ from rapid.teacher.decision import (
 )
 from rapid.teacher.experience import Experience
 from rapid.teacher.facts import Facts, gather, safest
-from rapid.teacher.logprobs import Token, action_probabilities
+from rapid.teacher.lessons import learn
+from rapid.teacher.logprobs import action_probabilities
 from rapid.teacher.memory import Episode, Memory, identify, show
 from rapid.teacher.patience import StoppedError
-from rapid.teacher.prompt import Prompt, outcome
-from rapid.teacher.reflection import (
-    LESSON_SCHEMA,
-    experience_of,
-    lesson_request,
-    moment,
-    read_lesson,
-    reflection_prompt,
-)
+from rapid.teacher.prompt import outcome
+from rapid.teacher.reflection import reflection_prompt
 from rapid.teacher.scene import read_scenes
+from rapid.teacher.talk import Talk, ask, opening, was_cut
 from rapid.teacher.tools import call_tool, tool_specifications
 
 T = TypeVar("T")
@@ -67,36 +59,9 @@ FAILURES_IN_A_ROW = 5
 """Conversations lost to the server, one after the other, after which it is taken to be down."""
 
 
-@dataclass
-class _Talk:
-    """The running account of one conversation."""
-
-    messages: list[Message]
-    tokens_in: int = 0
-    tokens_out: int = 0
-    retries: int = 0
-    answer: str = ""
-    tokens: tuple[Token, ...] = ()
-    served: str = ""
-    turns: int = 0
-    """Answers that came."""
-    faults: list[str] = field(default_factory=list[str])
-
-    def note(self, reply: Reply) -> None:
-        self.tokens_in += reply.tokens_in
-        self.tokens_out += reply.tokens_out
-        self.retries += reply.retries
-        self.answer, self.tokens, self.served = reply.text, reply.tokens, reply.model
-        self.turns += 1
-
-
 def _done(greet: Callable[[], None]) -> bool:
     greet()
     return True
-
-
-def _opening(prompt: Prompt) -> list[Message]:
-    return [{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}]
 
 
 class ConversingTeacher:
@@ -121,6 +86,7 @@ class ConversingTeacher:
         self._chat, self._config, self._identity, self._lanes = chat, config, identity, lanes
         self._failures = 0
         self._greet, self._patience = greet, patience_of(chat)
+        self._greetings: list[Decision] = []
 
     def describe(self) -> dict[str, Any]:
         """Return the teacher's identity."""
@@ -147,7 +113,7 @@ class ConversingTeacher:
             InterruptedDecisions: the user interrupted.
         """
         all_facts = [gather(scene) for scene in read_scenes(obs_BVF, self._lanes)]
-        self._get_ready()
+        self.get_ready()
         start = time.perf_counter()
         decisions = self._all_of([self._decide(*given) for given in zip(all_facts, previous, strict=True)])
         if isinstance(self._chat, BatchChat):
@@ -163,19 +129,29 @@ class ConversingTeacher:
 
     def look_back(self, episodes: Sequence[Episode]) -> Iterator[Experience]:
         """Give one experience for each episode; see :class:`rapid.teacher.memory.Reflective`."""
-        broken_off = False
+        broken_off, given_up = False, None
+        lessons = [learn(episode, self._lanes, self._config, self._patience) for episode in episodes]
         # To its end, where it raises what broke it off.
-        for result in self._lead([self._look_back(episode) for episode in episodes]):
+        for result in self._lead(lessons):
             if result is None:
                 broken_off = True
-            elif broken_off:
-                # A memory is in the order of its episodes: what comes after a gap is asked again.
-                if result[0].tokens_in:
-                    self._patience.lose()
-            else:
-                experience, fault = result
-                self._watch(fault)
-                yield experience
+                continue
+            experience, fault = result
+            if not (broken_off or given_up):
+                try:
+                    self._watch(fault)
+                except UnreachableError as error:
+                    given_up = error
+                    # The others are let go, which counts those under way.
+                    self._patience.drop()
+                else:
+                    yield experience
+                    continue
+            # A memory is in the order of its episodes: what comes after a gap is asked again.
+            if experience.tokens_in:
+                self._patience.lose()
+        if given_up:
+            raise given_up
         if broken_off:
             raise StoppedError(self._patience.reason)
 
@@ -188,15 +164,29 @@ class ConversingTeacher:
         """Wait for nothing beyond `moment`; see :class:`rapid.teacher.decision.Timed`."""
         self._patience.end_by(moment, reason)
 
-    def _get_ready(self) -> None:
-        """Before anything is driven, look whether the server is there and answers a question."""
+    @property
+    def greetings(self) -> Sequence[Decision]:
+        """Decisions that were paid for before anything was driven."""
+        return self._greetings
+
+    def get_ready(self) -> None:
+        """Look whether the server is there and answers a question; see :class:`rapid.teacher.decision.Timed`.
+
+        Raises:
+            RapidError: also if the server refuses the key or the model.
+            UnreachableError: it gives no answer.
+            StoppedError: the time set by :meth:`end_by` was over before.
+        """
         if self._greet is None:
             return
         # To its end, where it raises what broke it off.
         if list(attend([partial(_done, self._greet)], self._patience)) == [None]:
             raise StoppedError(self._patience.reason)
         facts = gather(read_scenes(np.zeros((1, 1, 5), np.float32), self._lanes)[0])
-        [decision] = self._lead([self._decide(facts, None)])
+        decision: Decision | None = None
+        for decision in self._lead([self._decide(facts, None)]):
+            if decision is not None and decision.tokens_in:
+                self._greetings.append(decision)
         if decision is None:
             raise StoppedError(self._patience.reason)
         if decision.unanswered:
@@ -240,49 +230,11 @@ class ConversingTeacher:
                 "Is it running and reachable? What was decided with it is kept: run the same command again."
             )
 
-    def _look_back(self, episode: Episode) -> Conversation[tuple[Experience, str]]:
-        """Return the experience, and what kept the server from answering, if something did."""
-        facts_T = [gather(scene) for scene in read_scenes(episode.obs_TVF, self._lanes)]
-        step = moment(episode, facts_T)
-        facts = facts_T[step]
-        experience = experience_of(episode, facts, step)
-        if not episode.crashed:
-            return experience, ""
-        talk = _Talk(_opening(reflection_prompt(facts_T, episode.decisions, step)))
-        choice, lost = Choice(None), ""
-        try:
-            reply = yield from self._ask(talk, [], LESSON_SCHEMA)
-            choice = read_lesson(reply.text, facts, _was_cut(reply))
-            if choice.action is None:
-                talk.messages.append({"role": "user", "content": lesson_request(choice.fault, facts)})
-                reply = yield from self._ask(talk, [], LESSON_SCHEMA)
-                choice = read_lesson(reply.text, facts, _was_cut(reply))
-        except ChatError as error:
-            lost = f"{NO_ANSWER}: {error}"
-        except RapidError as error:
-            self._count_turns(talk, error)
-            raise
-        if choice.action is not None:
-            # The reason was that of the decision that led to the crash.
-            experience = dataclasses.replace(
-                experience, action=choice.action, explanation="", lesson=choice.explanation
-            )
-        spent = {"tokens_in": talk.tokens_in, "tokens_out": talk.tokens_out, "cost": self._cost(talk)}
-        return dataclasses.replace(experience, **spent), lost
-
-    def _count_turns(self, talk: _Talk, error: RapidError) -> None:
-        """Count a conversation that ends between two turns; a request under way has been counted."""
-        if talk.turns and not (isinstance(error, StoppedError) and error.under_way):
-            self._patience.lose()
-
-    def _cost(self, talk: _Talk) -> float:
-        return (talk.tokens_in * self._config.price_in + talk.tokens_out * self._config.price_out) / 1e6
-
     def _decide(self, facts: Facts, previous: Decision | None) -> Conversation[Decision]:
         start = time.perf_counter()
         examples = [show(experience) for experience in self.memory.recall(facts.scene, self._config.few_shot)]
         prompt = briefing(facts, previous, self._config.style, self._chat.native_tools, examples)
-        talk = _Talk(_opening(prompt))
+        talk = Talk(opening(prompt))
         choice = Choice(None)
         try:
             choice = yield from self._reason(talk, facts)
@@ -292,7 +244,7 @@ class ConversingTeacher:
             talk.retries += error.retries
             talk.faults.append(f"{NO_ANSWER}: {error}")
         except RapidError as error:
-            self._count_turns(talk, error)
+            talk.break_off(error, self._patience)
             raise
         status, action, computed, probabilities = "repaired" if talk.faults else "ok", choice.action, "", None
         if action is None:
@@ -318,16 +270,16 @@ class ConversingTeacher:
             tokens_in=talk.tokens_in,
             tokens_out=talk.tokens_out,
             seconds=time.perf_counter() - start,
-            cost=self._cost(talk),
+            cost=talk.cost(self._config),
         )
 
-    def _reason(self, talk: _Talk, facts: Facts) -> Conversation[Choice]:
+    def _reason(self, talk: Talk, facts: Facts) -> Conversation[Choice]:
         """Let the model call tools until it answers without a call, or its turns are used up."""
         if self._config.style == "digest":
             return (yield from self._conclude(talk, facts))
         tools = tool_specifications()
         for _ in range(self._config.max_turns):
-            reply = yield from self._ask(talk, tools, None)
+            reply = yield from ask(talk, tools, None)
             called = read_call(spoken(reply.text)[0]) if not reply.calls else None
             if reply.calls:
                 for call in reply.calls:
@@ -339,17 +291,17 @@ class ConversingTeacher:
                 return self._read(talk, reply, facts, words=False)
         return (yield from self._correct(talk, facts, "No more tool calls."))
 
-    def _correct(self, talk: _Talk, facts: Facts, fault: str) -> Conversation[Choice]:
+    def _correct(self, talk: Talk, facts: Facts, fault: str) -> Conversation[Choice]:
         talk.messages.append({"role": "user", "content": repair_request(fault, facts, self._config.style)})
         return (yield from self._conclude(talk, facts))
 
-    def _conclude(self, talk: _Talk, facts: Facts) -> Conversation[Choice]:
+    def _conclude(self, talk: Talk, facts: Facts) -> Conversation[Choice]:
         """Let the model decide without any more tools: with one word, or by the schema."""
         one_word = self._config.style == "digest"
-        reply = yield from self._ask(talk, [], None if one_word else DECISION_SCHEMA, one_word)
+        reply = yield from ask(talk, [], None if one_word else DECISION_SCHEMA, one_word)
         return self._read(talk, reply, facts, words=True)
 
-    def _read(self, talk: _Talk, reply: Reply, facts: Facts, words: bool) -> Choice:
+    def _read(self, talk: Talk, reply: Reply, facts: Facts, words: bool) -> Choice:
         """Read a reply as a decision, and note why it is none, with what the user could do about it."""
         tools = self._config.style == "react"
         if reply.calls:
@@ -357,28 +309,8 @@ class ConversingTeacher:
         elif reply.reasoning and not reply.text.strip():
             choice = Choice(None, fault="The answer is thinking only, and holds no decision.")
         else:
-            choice = read_choice(reply.text, facts, words=words, cut=_was_cut(reply), tools=tools)
+            choice = read_choice(reply.text, facts, words=words, cut=was_cut(reply), tools=tools)
         if choice.action is None:
             limit = f" It was cut off at --teacher.max-answer-tokens {self._config.max_answer_tokens}."
-            talk.faults.append(choice.fault + (limit if _was_cut(reply) else ""))
+            talk.faults.append(choice.fault + (limit if was_cut(reply) else ""))
         return choice
-
-    def _ask(
-        self, talk: _Talk, tools: list[dict[str, Any]], schema: dict[str, Any] | None, logprobs: bool = False
-    ) -> Conversation[Reply]:
-        reply = yield Request(talk.messages, tools, schema, logprobs)
-        if isinstance(reply, ChatError):
-            raise reply
-        talk.note(reply)
-        message: Message = {"role": "assistant", "content": reply.text}
-        if reply.calls:
-            message["tool_calls"] = [
-                {"id": call.id, "type": "function", "function": {"name": call.name, "arguments": call.arguments}}
-                for call in reply.calls
-            ]
-        talk.messages.append(message)
-        return reply
-
-
-def _was_cut(reply: Reply) -> bool:
-    return reply.finish_reason == "length"

@@ -131,6 +131,19 @@ class Timed(Protocol):
         """Decisions that were broken off although something may have been paid for them."""
         ...
 
+    @property
+    def greetings(self) -> Sequence[Decision]:
+        """Decisions that :meth:`get_ready` paid for; they drive nothing."""
+        ...
+
+    def get_ready(self) -> None:
+        """Look whether whoever is asked answers, once and before anything is driven; :meth:`Teacher.decide` does, too.
+
+        Raises:
+            RapidError: there is no answer.
+        """
+        ...
+
     def end_by(self, moment: float, reason: str) -> None:
         """Wait for nothing beyond `moment` (of :func:`time.monotonic`); `reason` is a sentence.
 

@@ -8,7 +8,6 @@ step (:mod:`rapid.teacher.dialect`), and told once.
 import dataclasses
 import json
 import random
-import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -29,39 +28,19 @@ from rapid.teacher.completion import (
     read_reply,
 )
 from rapid.teacher.dialect import Dialect, Step, differences, features, steps, without_probabilities, write
+from rapid.teacher.faults import LONGEST_WAIT, FormRefusedError, PassingError, fault_of, key_error
 from rapid.teacher.patience import FIRST_WORD, Patience, StoppedError
 from rapid.teacher.secrets import Secrets
 from rapid.teacher.wire import WireError, exchange
 
 T = TypeVar("T")
 
-LONGEST_WAIT = 60.0
-"""Seconds; a server that asks for a longer pause is not waited for."""
 LOADING_WAIT = 600.0
 """Seconds that a server may take to load its model."""
 _LOADING_LOOK = 1.0
 """Seconds between two looks whether it has."""
-_LOADING = re.compile(r"\bloading\b|being loaded|not (yet )?(been )?loaded|warming up|starting up", re.IGNORECASE)
 _BETWEEN_LINES = 10.0
 """Seconds between two lines on a pause."""
-
-
-class _RefusedError(Exception):
-    """The server does not take the request as it is."""
-
-    def __init__(self, refusal: Refusal) -> None:
-        super().__init__(f"HTTP {refusal.status}: {refusal.said}")
-        self.refusal = refusal
-        self.words = f"{refusal.said} {refusal.parameter} {refusal.code}"
-
-
-class _PassingError(Exception):
-    """Something that another try may cure."""
-
-    def __init__(self, message: str, refusal: Refusal | None = None) -> None:
-        super().__init__(message)
-        self.refusal = refusal
-        self.loading = refusal is not None and refusal.status == 503 and _LOADING.search(refusal.said) is not None
 
 
 class Endpoint:
@@ -110,7 +89,7 @@ class Endpoint:
         def once() -> tuple[str, ...]:
             try:
                 return read_names(self._exchange("GET", "models", b""), self._clean)
-            except (_RefusedError, FormError):
+            except (FormRefusedError, FormError):
                 return ()
 
         return self._tried(once, [0])
@@ -138,7 +117,7 @@ class Endpoint:
         try:
             try:
                 return self._ask(request, dialect, retries)
-            except _RefusedError as refused:
+            except FormRefusedError as refused:
                 # One thread finds out what it is; those that wait here may find it known already.
                 with self._adapting:
                     return self._adapt(request, dialect, refused, retries)
@@ -174,7 +153,7 @@ class Endpoint:
     def _names_a_step(self, words: str, request: Request, dialect: Dialect) -> bool:
         return any(step.is_meant(words) for step in steps(dialect, request, self._config.tool_calling == "auto"))
 
-    def _adapt(self, request: Request, before: Dialect, refused: _RefusedError, retries: list[int]) -> Reply:
+    def _adapt(self, request: Request, before: Dialect, refused: FormRefusedError, retries: list[int]) -> Reply:
         """Find a dialect in which the server takes a request, giving up what it names, or else one thing after another.
 
         What turns out to have been no hindrance is taken up again. What was accepted before is given up for this
@@ -183,7 +162,7 @@ class Endpoint:
         if self._dialect != before:
             try:
                 return self._ask(request, self._dialect, retries)
-            except _RefusedError as error:
+            except FormRefusedError as error:
                 refused = error
         base = dialect = self._dialect
         known = features(base, request) in self._proven
@@ -204,13 +183,13 @@ class Endpoint:
             dialect = step.simpler
             try:
                 reply = self._ask(request, dialect, retries)
-            except _RefusedError as error:
+            except FormRefusedError as error:
                 refused = error
         for fields in list(given_up)[:-1]:
             again = dataclasses.replace(dialect, **{name: getattr(base, name) for name in fields})
             try:
                 reply = self._ask(request, again, retries)
-            except _RefusedError:
+            except FormRefusedError:
                 continue
             dialect = again
             del given_up[fields]
@@ -221,28 +200,22 @@ class Endpoint:
             self._tell(f"It refused a request ({first}). From now on: {gone}.")
         return reply
 
-    def _final(self, refused: _RefusedError, retries: int) -> Exception:
+    def _final(self, refused: FormRefusedError, retries: int) -> Exception:
         """Return the error for a request that the server takes in no form."""
         if refused.refusal.status == 403:
-            return self._key_error(refused.refusal)
+            return key_error(refused.refusal, self._config)
         what = "" if refused.refusal.status >= 500 else "the request was refused: "
         return ChatError(f"{what}{refused}", retries)
-
-    def _key_error(self, refusal: Refusal) -> RapidError:
-        return RapidError(
-            f"{self._config.base_url} refuses the key: HTTP {refusal.status}: {refusal.said}. Put a valid key into the "
-            f"environment variable {self._config.api_key_env or 'that --teacher.api-key-env names'}."
-        )
 
     def _exchange(self, method: str, name: str, body: bytes) -> Mapping[str, Any]:
         """Make one request and return the object that came."""
         self._wait_for_slot()
-        with self.patience.flight(self._config.timeout_s) as flight:
+        with self.patience.flight(self._config.timeout_s, paid=method == "POST") as flight:
             try:
                 response = exchange(method, self._address, name, self._headers, body, flight, self._most_bytes)
             except WireError as error:
                 said = self._clean(str(error))
-                raise (ChatError(said) if error.lasting else _PassingError(said)) from None
+                raise (ChatError(said) if error.lasting else PassingError(said)) from None
         if response.status == 200:
             answer = decode(response.body, response.headers.get("content-type", ""), self._clean)
             refusal = find_refusal(answer, response.headers, self._clean)
@@ -250,34 +223,8 @@ class Endpoint:
                 return answer
         else:
             refusal = read_refusal(response.status, response.headers, response.body, self._clean)
-        raise self._fault(refusal, method, self._clean(response.headers.get("location", "")))
-
-    def _fault(self, refusal: Refusal, method: str, location: str) -> Exception:
-        """Return what a refusal means."""
-        status, said = refusal.status, f"HTTP {refusal.status}: {refusal.said}"
-        url = self._config.base_url
-        if status == 401:
-            return self._key_error(refusal)
-        if status in (400, 403, 413, 422, 501) or (status in (404, 405) and method == "GET"):
-            return _RefusedError(refusal)
-        if status in (404, 405):
-            return RapidError(
-                f"{url} does not know the model '{self._config.model}', or is no OpenAI-style address: {said}. Check "
-                "--teacher.model and --teacher.base-url."
-            )
-        if status == 402 or refusal.code in ("insufficient_quota", "billing_hard_limit_reached"):
-            return RapidError(f"{url} wants to be paid first: {said}. What was collected is kept.")
-        if status == 407:
-            variable = self._address.proxy.variable if self._address.proxy else "the proxy"
-            return RapidError(f"The proxy refuses to serve without a password: {said}. Put it into {variable}.")
-        if 300 <= status < 400:
-            return RapidError(f"{url} points elsewhere ({said}): set --teacher.base-url to {location or 'that'}.")
-        if refusal.after is not None and refusal.after > LONGEST_WAIT:
-            pause = format_seconds(refusal.after)
-            return RapidError(f"{url} wants to be left alone for {pause}: {said}. Run the same command again then.")
-        if status in (408, 409, 425, 429) or status >= 500:
-            return _PassingError(said, refusal)
-        return ChatError(said)
+        location = self._clean(response.headers.get("location", ""))
+        raise fault_of(refusal, method, location, self._config, self._address)
 
     def _tried(
         self,
@@ -293,13 +240,13 @@ class Endpoint:
                 return action()
             except ChatError as error:
                 raise ChatError(str(error), retries[0]) from None
-            except (_PassingError, FormError) as error:
-                refusal = error.refusal if isinstance(error, _PassingError) else None
+            except (PassingError, FormError) as error:
+                refusal = error.refusal if isinstance(error, PassingError) else None
                 # Some call it an error of their own that they cannot write a conversation down for their model.
                 strange = refusal if refusal is not None and refusal.status == 500 else None
                 if strange and named(strange.said):
-                    raise _RefusedError(strange) from None
-                if isinstance(error, _PassingError) and error.loading:
+                    raise FormRefusedError(strange) from None
+                if isinstance(error, PassingError) and error.loading:
                     loaded_by = loaded_by or time.monotonic() + LOADING_WAIT
                     if time.monotonic() < loaded_by:
                         self._tell(f"It is still loading its model; that may take {format_seconds(LOADING_WAIT)}.")
@@ -308,7 +255,7 @@ class Endpoint:
                 lasting = isinstance(error, FormError) and error.lasting
                 if lasting or retries[0] >= self._config.max_retries:
                     if strange and used and used not in self._proven:
-                        raise _RefusedError(strange) from None
+                        raise FormRefusedError(strange) from None
                     raise ChatError(str(error), retries[0]) from None
                 pause = self._pause(refusal, retries[0])
                 if pause >= FIRST_WORD:

@@ -107,8 +107,8 @@ class Patience:
             self.check()
 
     @contextmanager
-    def flight(self, seconds: float) -> Generator[Flight, None, None]:
-        """Count a request that may take so many seconds as under way while the block runs."""
+    def flight(self, seconds: float, paid: bool = True) -> Generator[Flight, None, None]:
+        """Count a request that may take so many seconds as under way while the block runs; `paid`, if it costs."""
         self.check()
         flight = Flight(self, seconds)
         with self._lock:
@@ -121,7 +121,8 @@ class Patience:
                 self._slowest = max(self._slowest, time.monotonic() - flight.start)
         except StoppedError as stopped:
             stopped.under_way = True
-            self.lose()
+            if paid:
+                self.lose()
             raise
         finally:
             with self._lock:
