@@ -34,7 +34,7 @@ from rapid.config_learning import RobustConfig as RobustConfig
 
 Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full"]
-Plan = Literal["printed", "careful", "bold", "ppo", "robust"]
+Plan = Literal["printed", "careful", "bold", "ppo", "robust", "guided"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
 PLANS: tuple[str, ...] = typing.get_args(Plan)

@@ -77,10 +77,14 @@ STEPS: dict[Plan, dict[Scale, tuple[int, int]]] = {
     "bold": {"tiny": (200, 0), "quick": (30_000, 0), "full": (100_000, 0)},
     "ppo": {"tiny": (200, 7_680), "quick": (30_000, 115_200), "full": (300_000, 700_000)},
     "robust": {"tiny": (0, 7_680), "quick": (0, 153_600), "full": (0, 600_000)},
+    "guided": {"tiny": (200, 7_680), "quick": (30_000, 153_600), "full": (300_000, 921_600)},
 }
 """Environment steps of phase 3, by Q-learning and then by PPO."""
 DEFAULT_PLAN: dict[Recipe, Plan] = {"paper": "printed", "strong": "bold"}
-OF_RECIPE: dict[Recipe, tuple[Plan, ...]] = {"paper": ("printed",), "strong": ("careful", "bold", "ppo", "robust")}
+OF_RECIPE: dict[Recipe, tuple[Plan, ...]] = {
+    "paper": ("printed",),
+    "strong": ("careful", "bold", "ppo", "robust", "guided"),
+}
 
 
 def preset(recipe: str = "strong", scale: str = "quick", plan: str = "") -> Config:
@@ -250,12 +254,34 @@ def _under_attack(adapt: AdaptConfig) -> AdaptConfig:
     )
 
 
+def _guided(adapt: AdaptConfig) -> AdaptConfig:
+    """Return the plan `ppo`, after which the policy is shown under attack what to do (docs/algorithms/adapt.md)."""
+    calm = _far_sighted(adapt)
+    return replace(
+        calm,
+        memory=True,
+        adversary=replace(
+            calm.adversary,
+            gradient_share=0.4,
+            targeted_share=0.2,
+            near_share=0.8,
+            spared_share=0.05,
+            steps=10,
+            noise_share=0.1,
+            noise=0.35,
+            begin=0.75,
+            guided=0.25,
+        ),
+    )
+
+
 _PLANS: dict[Plan, Callable[[AdaptConfig], AdaptConfig]] = {
     "printed": _as_it_is,
     "careful": _as_it_is,
     "bold": _boldly,
     "ppo": _far_sighted,
     "robust": _under_attack,
+    "guided": _guided,
 }
 
 OfflineBaseline = Literal["dqn", "ddqn", "cql", "bc"]

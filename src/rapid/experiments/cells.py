@@ -74,9 +74,12 @@ class Distill:
 
 @dataclass(frozen=True)
 class Adapt:
-    """An agent that goes on online (phase 3); `data` goes into its batches and tells what it forgets."""
+    """An agent that goes on online (phase 3); `data` goes into its batches and tells what it forgets.
 
-    origin: "Distill | Adapt | Fresh"
+    As a `Driver` its origin is a shipped agent.
+    """
+
+    origin: "Distill | Adapt | Fresh | Driver"
     data: Mix | None
     scenario: str
     settings: AdaptConfig

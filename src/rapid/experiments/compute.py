@@ -79,7 +79,9 @@ def compute(cell: Cell, place: Path, given: Mapping[str, Path]) -> None:
             distill_agent(_settings(cell), given[key(cell.data)] / "data", place)
         case Adapt():
             data = given[key(cell.data)] / "data" if cell.data else None
-            adapt_agent(_settings(cell), given[key(cell.origin)] / "agent", data, place)
+            # The name of a shipped agent is read like a directory.
+            origin = Path(cell.origin.name) if isinstance(cell.origin, Driver) else given[key(cell.origin)] / "agent"
+            adapt_agent(_settings(cell), origin, data, place)
         case Drive():
             _drive(cell, place, given)
         case Scenes():
@@ -102,10 +104,8 @@ def _settings(cell: Distill | Adapt) -> Config:
         )
     adapt = replace(cell.settings, scenario=cell.scenario)
     config = replace(base, scenario=cell.scenario, adapt=adapt, evaluate=evaluate)
-    origin: Any = cell.origin
-    while isinstance(origin, Adapt):
-        origin = origin.origin
-    config = replace(config, network=origin.network)
+    origin = _root(cell)
+    config = replace(config, network=_network(cell))
     return replace(config, distill=origin.settings, mix=origin.data.settings) if isinstance(origin, Distill) else config
 
 
@@ -237,9 +237,9 @@ def work_of(cell: Cell) -> tuple[str, float]:
             attacked = "-attacked" if settings.adversary.gradient_share else ""
             part = f"ppo{attacked}" if settings.ppo.steps else "q"
             updates = settings.steps * settings.updates_per_step
-            return f"adapt/{_size(_root(cell).network)}/{part}", settings.ppo.steps or max(updates, 1.0)
+            return f"adapt/{_size(_network(cell))}/{part}", settings.ppo.steps or max(updates, 1.0)
         case Drive():
-            who = cell.agent.name if isinstance(cell.agent, Driver) else _size(_root(cell.agent).network)
+            who = cell.agent.name if isinstance(cell.agent, Driver) else _size(_network(cell.agent))
             return f"drive/{who}/{cell.attack.partition(':')[0]}", float(cell.spawns)
         case Decide():
             return f"decide/{cell.agent.name if isinstance(cell.agent, Driver) else 'policy'}", cell.decisions
@@ -251,7 +251,18 @@ def _size(network: NetworkConfig) -> str:
     return network.kind if network.kind == "mlp" else f"{network.kind}/{network.width}x{network.layers}"
 
 
-def _root(agent: Distill | Adapt | Fresh) -> Distill | Fresh:
+def _root(agent: Distill | Adapt | Fresh | Driver) -> Distill | Fresh | Driver:
     while isinstance(agent, Adapt):
         agent = agent.origin
     return agent
+
+
+def _network(agent: Distill | Adapt | Fresh | Driver) -> NetworkConfig:
+    """Return the settings of the network that an agent began with."""
+    root = _root(agent)
+    return _of_shipped(root.name) if isinstance(root, Driver) else root.network
+
+
+@cache
+def _of_shipped(name: str) -> NetworkConfig:
+    return load_agent(name).network.config

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+from rapid.agents.shipped import shipped_agents
 from rapid.config import Config, MixConfig, TeacherConfig
 from rapid.experiments.cells import Adapt, Data, Distill, Driver, Fresh, Mix, Relabel, Shipped
 from rapid.presets import OnlineBaseline, offline_baseline, online_baseline, preset
@@ -159,6 +160,32 @@ def robust(setting: Setting) -> Adapt:
     return Adapt(agent, None, setting.scenario, settings, setting.seed)
 
 
+GUIDED_STEPS = 199_680
+"""Environment steps in which a trained agent is shown what to do under attack: 52 rollouts."""
+
+
+def guided(setting: Setting) -> Adapt:
+    """Return RAPID that is shown under attack what to do, after its phase 3 by the plan `ppo`.
+
+    It goes on from the agent of that plan that is shipped for the scenario, where one is: all seeds from the same.
+    """
+    settings = setting.config(plan="guided").adapt
+    steps = GUIDED_STEPS if setting.effort.steps is None else settings.ppo.steps
+    settings = replace(
+        settings,
+        steps=0,
+        ppo=replace(settings.ppo, steps=steps, critic_steps=0),
+        adversary=replace(settings.adversary, begin=0.0, guided=1.0),
+        evaluate_every=steps // CURVE_POINTS,
+    )
+    shipped_one = f"{setting.scenario}/rapid"
+    if shipped_one in shipped_agents():
+        origin = Driver(f"shipped:{shipped_one}")
+    else:
+        origin = rapid(setting, _paper_data(setting), plan="ppo")
+    return Adapt(origin, None, setting.scenario, settings, setting.seed, setting.effort.curve_spawns)
+
+
 def adapted(
     setting: Setting, data: Mix, plan: str = "", train: Literal["adapter", "all", "scratch"] = "adapter"
 ) -> Adapt:
@@ -294,6 +321,7 @@ METHODS: dict[str, Method] = {
             "learned",
             robust,
         ),
+        Method("rapid-guided", "RAPID, guided under attack", "learned", guided),
         Method("mlp-ppo", "MLP, 300K + 700K PPO", "learned", mlp_by_ppo),
         Method("online-ddqn-10k", "online DDQN, 10K", "learned", lambda s: from_scratch(s, "ddqn", "careful")),
         Method(
