@@ -191,7 +191,7 @@ def test_policy_and_critic_learn_beside_each_other_with_the_same_result():
     assert found[0] == found[1] != (weights(network()), weights(learner.critic))
 
 
-def test_with_compiled_attention_it_learns_the_same_but_for_rounding(tmp_path: Path):
+def test_with_compiled_layers_it_learns_the_same_but_for_rounding(tmp_path: Path):
     compiled = replace(CONFIG, ppo=replace(PPO, attention="compiled"))
     net = build_network(NetworkConfig(), 3, 0)
     ours, torchs = (train(tmp_path / c.ppo.attention, c, net=copy.deepcopy(net)) for c in (compiled, CONFIG))
@@ -205,7 +205,7 @@ def test_with_compiled_attention_it_learns_the_same_but_for_rounding(tmp_path: P
     for first, second in zip(lines(tmp_path / "compiled"), lines(tmp_path / "torch"), strict=True):
         assert first["value"] == pytest.approx(second["value"], rel=1e-3)
     assert weights(train(tmp_path / "again", compiled, net=net)) == weights(ours)
-    # Whoever uses the network afterwards has torch's attention.
+    # Whoever uses the network afterwards has torch's layers.
     assert not any(module.compiled for module in ours.modules() if isinstance(module, Block))
 
 
