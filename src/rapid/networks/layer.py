@@ -13,11 +13,14 @@ sample: T, or 1 where only its first token is wanted; so there are B*Q rows of r
 needs, one kind behind another.
 """
 
+import weakref
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch._utils import _flatten_dense_tensors
@@ -86,10 +89,30 @@ def _computed(
     (batch, length), queries, width = read_BT.shape, sizes[0], sizes[2]
     # Without a gradient, room for the tokens that are computed together.
     samples = batch if keeps else min(batch, _together(length))
-    kept = joined.new_empty(_kept(samples, length, *sizes[:4])[-1])
+    kept = _room(_kept(samples, length, *sizes[:4])[-1])
     out = joined.new_empty(batch * queries * width)
     _forward(*(each.numpy() for each in (_flat(rows), read_BT, joined.detach(), kept, out)), *sizes, keeps)
     return out.view(-1, width), joined, kept
+
+
+def _room(size: int) -> Tensor:
+    """Return memory for so many numbers, which may have been used before; when no tensor needs it, it is again.
+
+    The operating system clears the pages of what it gives out, which takes a tenth as long as the layer.
+    """
+    try:
+        held = _spare.pop()
+    except IndexError:
+        held = np.empty(size, np.float32)
+    if len(held) < size:
+        held = np.empty(size, np.float32)
+    lent = held[:size]
+    weakref.finalize(lent, _spare.append, held).atexit = False
+    return torch.from_numpy(lent)
+
+
+_spare: deque[NDArray[np.float32]] = deque(maxlen=4)
+"""Memory that no tensor needs; taking and giving back are safe from several threads."""
 
 
 def _flat(rows: Tensor) -> Tensor:
