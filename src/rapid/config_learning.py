@@ -211,8 +211,8 @@ class PpoConfig:
     critic_max_grad_norm: AboveZero = 1.0
     """The critic's gradients are clipped to this norm."""
     attention: Literal["torch", "compiled"] = "torch"
-    """Who computes the attention of up to 16 tokens while learning: torch, or on a CPU RAPID's own compiled code, which
-    is faster at it and rounds otherwise."""
+    """Who computes the layers of transformers of up to 16 tokens while learning, attention and all: torch, or on a CPU
+    RAPID's own compiled code, which is faster at it and rounds otherwise."""
 
 
 @dataclass(frozen=True)

@@ -191,7 +191,7 @@ def test_policy_and_critic_learn_beside_each_other_with_the_same_result():
     assert found[0] == found[1] != (weights(network()), weights(learner.critic))
 
 
-def test_with_compiled_attention_it_learns_the_same_but_for_rounding(tmp_path: Path):
+def test_with_compiled_layers_it_learns_the_same_but_for_rounding(tmp_path: Path):
     compiled = replace(CONFIG, ppo=replace(PPO, attention="compiled"))
     net = build_network(NetworkConfig(), 3, 0)
     ours, torchs = (train(tmp_path / c.ppo.attention, c, net=copy.deepcopy(net)) for c in (compiled, CONFIG))
@@ -205,8 +205,26 @@ def test_with_compiled_attention_it_learns_the_same_but_for_rounding(tmp_path: P
     for first, second in zip(lines(tmp_path / "compiled"), lines(tmp_path / "torch"), strict=True):
         assert first["value"] == pytest.approx(second["value"], rel=1e-3)
     assert weights(train(tmp_path / "again", compiled, net=net)) == weights(ours)
-    # Whoever uses the network afterwards has torch's attention.
+    # Whoever uses the network afterwards has torch's layers.
     assert not any(module.compiled for module in ours.modules() if isinstance(module, Block))
+
+
+def test_an_attack_on_compiled_layers_has_the_gradient_of_what_is_seen_alone_and_bit_for_bit_the_same():
+    net = build_network(NetworkConfig(), 3, 0)
+    torch.nn.init.constant_(cast(Any, net.gate), 0.3)
+    set_phase(net, "adapt")
+    learner = PpoLearner(net, replace(PPO, attention="compiled"), 1.0, True, 0, 4)
+    trained = [parameter for parameter in net.parameters() if parameter.requires_grad]
+    seen = torch.from_numpy(make_vec(SCENARIO, num_envs=6).reset(seed=0)[0]).float().requires_grad_()
+    with learner.computing():
+        attacked, whole = learner.q_values(seen), net(seen)
+        assert torch.equal(attacked, whole)
+        ours = torch.autograd.grad(attacked.sum(), [seen, *trained], allow_unused=True, retain_graph=True)
+        theirs = torch.autograd.grad(whole.sum(), [seen, *trained], materialize_grads=True)
+    assert torch.equal(ours[0], theirs[0])
+    assert all(gradient is None for gradient in ours[1:])
+    assert any(bool(gradient.any()) for gradient in theirs[1:])
+    assert trained == [parameter for parameter in net.parameters() if parameter.requires_grad]
 
 
 def test_the_policy_waits_until_the_critic_has_learned(tmp_path: Path):

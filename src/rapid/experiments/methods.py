@@ -83,7 +83,7 @@ class Setting:
                 learning_starts=min(adapt.learning_starts, effort.steps // 4),
             )
         every = max(1, (adapt.steps or adapt.ppo.steps) // CURVE_POINTS)
-        # As what is published was trained: the compiled attention rounds otherwise.
+        # As what is published was trained: compiled layers round otherwise.
         ppo = replace(adapt.ppo, attention="torch")
         adapt = replace(adapt, scenario=self.scenario, evaluate_every=every, ppo=ppo)
         return replace(config, scenario=self.scenario, seed=self.seed, distill=distill, adapt=adapt)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rapid.networks.attention import attend, can_attend
+from rapid.networks import layer
 
 
 class Block(nn.Module):
@@ -25,7 +25,7 @@ class Block(nn.Module):
         super().__init__()
         self.heads = heads
         self.compiled = False
-        """Whether attention is by :mod:`rapid.networks.attention` where it can be: faster, and rounded otherwise."""
+        """Whether it is computed by :mod:`rapid.networks.layer` where it can be: faster, and rounded otherwise."""
         self.attention_norm = nn.LayerNorm(width)
         self.query_key_value = nn.Linear(width, 3 * width)
         self.attention_out = nn.Linear(width, width)
@@ -33,7 +33,14 @@ class Block(nn.Module):
         self.feedforward_in = nn.Linear(width, feedforward)
         self.feedforward_out = nn.Linear(feedforward, width)
 
-    def forward(self, rows: Tensor, length: int, mask_B11T: Tensor | None, first_only: bool = False) -> Tensor:
+    def forward(
+        self,
+        rows: Tensor,
+        length: int,
+        mask_B11T: Tensor | None,
+        first_only: bool = False,
+        closing: nn.LayerNorm | None = None,
+    ) -> Tensor:
         """Return the rows (B*T, D) after this layer; with `first_only` each sample's first token only (B, D).
 
         The value of the first token is the same either way; alone, it needs no other query and no other feed-forward.
@@ -43,20 +50,26 @@ class Block(nn.Module):
             length: T.
             mask_B11T: added to the attention scores.
             first_only: whether only the first token is wanted.
+            closing: a norm that the rows go through at last.
         """
-        if self.compiled and not first_only and can_attend(rows, length, self.heads):
-            projected = self.query_key_value(self.attention_norm(rows))
-            attended = attend(projected, length, self.heads, mask_B11T)
-        else:
-            query, key, value = self._project(rows, length, first_only)
-            attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask_B11T)
-            attended = attended.transpose(1, 2).reshape(-1, rows.shape[-1])
-            if first_only:
-                rows = rows.unflatten(0, (-1, length))[:, 0]
+        if self.compiled and layer.can_compute(rows, length, self.heads, self.feedforward_in.out_features):
+            parts = (
+                *(self.attention_norm, self.query_key_value, self.attention_out),
+                *(self.feedforward_norm, self.feedforward_in, self.feedforward_out),
+                *((closing,) if closing else ()),
+            )
+            parameters = [parameter for part in parts for parameter in (part.weight, part.bias)]
+            return layer.compute(rows, length, self.heads, mask_B11T, first_only, parameters)
+        query, key, value = self._project(rows, length, first_only)
+        attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask_B11T)
+        attended = attended.transpose(1, 2).reshape(-1, rows.shape[-1])
+        if first_only:
+            rows = rows.unflatten(0, (-1, length))[:, 0]
         # In place, which needs less memory at once: up to a tenth faster.
         rows = self.attention_out(attended).add_(rows)
         hidden = functional.relu_(self.feedforward_in(self.feedforward_norm(rows)))
-        return self.feedforward_out(hidden).add_(rows)
+        rows = self.feedforward_out(hidden).add_(rows)
+        return closing(rows) if closing else rows
 
     def attention(self, rows: Tensor, length: int, mask_B11T: Tensor | None) -> Tensor:
         """Return the attention probabilities of the layer (B, H, T queries, T keys)."""
@@ -82,17 +95,31 @@ class Block(nn.Module):
         return tuple(part.transpose(1, 2) for part in split.unbind(2))
 
 
+class Projection(nn.Linear):
+    """A linear layer that reads the few features of a vehicle."""
+
+    compiled = False
+    """Whether its gradient is by :mod:`rapid.networks.layer`: faster on a CPU, and rounded otherwise."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Return the rows (..., D) of features (..., F)."""
+        if self.compiled and layer.is_plain(input):
+            return layer.project(input, self.weight, self.bias)
+        return super().forward(input)
+
+
 @contextmanager
-def compiled_attention(*networks: nn.Module) -> Generator[None]:
-    """Let the layers of some networks attend by :mod:`rapid.networks.attention` meanwhile."""
-    blocks = [module for network in networks for module in network.modules() if isinstance(module, Block)]
-    for block in blocks:
-        block.compiled = True
+def compiled_layers(*networks: nn.Module) -> Generator[None]:
+    """Let the layers of some networks be computed by :mod:`rapid.networks.layer` meanwhile."""
+    modules = [module for network in networks for module in network.modules()]
+    layers = [module for module in modules if isinstance(module, Block | Projection)]
+    for each in layers:
+        each.compiled = True
     try:
         yield
     finally:
-        for block in blocks:
-            block.compiled = False
+        for each in layers:
+            each.compiled = False
 
 
 class Transformer(nn.Module):
@@ -108,9 +135,9 @@ class Transformer(nn.Module):
         length, last = tokens_BTD.shape[1], len(self.blocks) - 1
         rows = tokens_BTD.flatten(0, 1)
         for index, block in enumerate(self.blocks):
-            rows = block(rows, length, mask_B11T, first_only and index == last)
-        encoded = self.norm(rows)
-        return encoded if first_only else encoded.view(tokens_BTD.shape)
+            closing = self.norm if index == last else None
+            rows = block(rows, length, mask_B11T, first_only and index == last, closing)
+        return rows if first_only else rows.view(tokens_BTD.shape)
 
     def attention(self, tokens_BTD: Tensor, mask_B11T: Tensor | None) -> Tensor:
         """Return the attention probabilities of every layer (B, L, H, T queries, T keys)."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from rapid.config_learning import NetworkConfig
-from rapid.networks.blocks import Transformer
+from rapid.networks.blocks import Projection, Transformer
 from rapid.networks.encoding import num_inputs
 from rapid.networks.memory import Recalled
 
@@ -21,7 +21,7 @@ class PolicyEncoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.projection = nn.Linear(num_inputs(config.input), config.width)
+        self.projection = Projection(num_inputs(config.input), config.width)
         if config.position == "learned":
             self.position = nn.Parameter(torch.empty(config.vehicles, config.width))
         elif config.position == "ego":
@@ -122,7 +122,7 @@ class MixtureOfPolicies(nn.Module):
 
 def _router(inputs: int, width: int, num_policies: int) -> nn.Sequential:
     """A small MLP that scores the policies for one vehicle."""
-    return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, num_policies))
+    return nn.Sequential(Projection(inputs, width), nn.ReLU(), nn.Linear(width, num_policies))
 
 
 def sinusoids(length: int, width: int) -> Tensor:

@@ -24,7 +24,7 @@ from rapid.config_io import least_steps
 from rapid.config_learning import AdaptConfig, NetworkConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
-from rapid.networks.blocks import compiled_attention
+from rapid.networks.blocks import compiled_layers
 from rapid.networks.denormals import no_denormals
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.progress import Task
@@ -213,14 +213,14 @@ class PpoLearner:
 
     @contextmanager
     def computing(self) -> Generator[None]:
-        """Drive and learn within this: attention as the settings say, and torch with one thread wherever it is called.
+        """Drive and learn within this: layers as the settings say, and torch with one thread wherever it is called.
 
         Torch's own threads wait for each other actively, which costs more than they gain with tensors of this size.
         """
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            with compiled_attention(*((self.network, self.critic) if self.config.attention == "compiled" else ())):
+            with compiled_layers(*((self.network, self.critic) if self.config.attention == "compiled" else ())):
                 yield
         finally:
             torch.set_num_threads(threads)
@@ -230,8 +230,17 @@ class PpoLearner:
         return obs_BVF if self._sees_clock else without_clock(obs_BVF)
 
     def q_values(self, seen_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
-        """Return the policy's Q-values (B, A)."""
-        return self.network(seen_BVF, state_BS)
+        """Return the policy's Q-values (B, A); their gradient goes to what is seen, and not to compiled weights."""
+        compiled = self.config.attention == "compiled"
+        # Compiled layers cannot know what a gradient will be taken of.
+        spared = [weight for weight in self._trained if weight.requires_grad] if compiled else []
+        for weight in spared:
+            weight.requires_grad_(False)
+        try:
+            return self.network(seen_BVF, state_BS)
+        finally:
+            for weight in spared:
+                weight.requires_grad_(True)
 
     def log_probs(self, seen_BVF: Tensor, state_BS: Tensor | None = None, first_BVD: Tensor | None = None) -> Tensor:
         """Return the policy's log-probabilities (B, A) = log softmax(Q / T) for what it sees and remembers.
