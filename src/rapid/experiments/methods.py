@@ -160,8 +160,8 @@ def robust(setting: Setting) -> Adapt:
     return Adapt(agent, None, setting.scenario, settings, setting.seed)
 
 
-GUIDED_STEPS = 199_680
-"""Environment steps in which a trained agent is shown what to do under attack: 52 rollouts."""
+GUIDED_STEPS = 153_600
+"""Environment steps in which a trained agent is shown what to do under attack: 40 rollouts."""
 
 
 def guided(setting: Setting) -> Adapt:
@@ -174,7 +174,7 @@ def guided(setting: Setting) -> Adapt:
     settings = replace(
         settings,
         steps=0,
-        ppo=replace(settings.ppo, steps=steps, critic_steps=0),
+        ppo=replace(settings.ppo, steps=steps, critic_steps=0, attention="compiled"),
         adversary=replace(settings.adversary, begin=0.0, guided=1.0),
         evaluate_every=steps // CURVE_POINTS,
     )
