@@ -59,6 +59,11 @@ MADE = {
         "strong, plan robust",
         _MIXED.format(_HOME) + "; 600,000 online steps under attack in lane-3-density-2",
     ),
+    "guided": Made(
+        "RAPID, guided",
+        "strong, plan guided",
+        _MIXED + "; 1,000,000 online steps, then 153,600 under attack in which it was shown what to do",
+    ),
 }
 LIMITS = (
     "It drives HighwayEnv's straight highway in the scenario named, and nothing else. It is no driver of real cars. "
