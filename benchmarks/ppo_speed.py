@@ -71,7 +71,7 @@ def compete(plan: str, attack_steps: int, scenario: str, threads: int, attention
     from rapid.networks import q_network
     from rapid.presets import preset
     from rapid.scenarios import get_scenario
-    from rapid.training import ppo
+    from rapid.training import ppo_learner as ppo
     from rapid.training.collector import Collector
     from rapid.training.machinery import adam, adversary, worlds
     from rapid.training.machinery.record import network_fingerprint

@@ -49,8 +49,8 @@ def explained_metrics() -> set[str]:
 
 def test_every_term_that_a_trainer_writes_is_explained():
     from rapid.training.learner import TERMS
-    from rapid.training.ppo import SHOWN, VALUE
-    from rapid.training.ppo import TERMS as OF_PPO
+    from rapid.training.ppo_learner import SHOWN, VALUE
+    from rapid.training.ppo_learner import TERMS as OF_PPO
 
     assert {*TERMS, *VALUE, *OF_PPO, *SHOWN} <= explained_metrics()
 

@@ -25,7 +25,7 @@ from rapid.training.collector import Collector
 from rapid.training.machinery.adversary import AWAY, CLEAN, NOISE, TOWARDS, Adversary
 from rapid.training.machinery.diagnostics import Forgetting
 from rapid.training.machinery.worlds import Drive, Explorer
-from rapid.training.ppo import PpoLearner
+from rapid.training.ppo_learner import PpoLearner
 
 SCENARIO = "lane-3-density-2"
 MIXTURE = AdversaryConfig(gradient_share=0.5, noise_share=0.25, steps=2)

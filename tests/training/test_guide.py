@@ -26,7 +26,7 @@ from rapid.training.collector import Collector
 from rapid.training.machinery.adversary import CLEAN
 from rapid.training.machinery.guide import CERTAINTY, Guide
 from rapid.training.machinery.worlds import Drive
-from rapid.training.ppo import PpoLearner
+from rapid.training.ppo_learner import PpoLearner
 
 PLAN = [SLOWER, SLOWER, LANE_RIGHT, FASTER]
 GUIDED = replace(ATTACKED, adversary=replace(MIXTURE, guided=0.5))

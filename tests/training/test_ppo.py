@@ -22,11 +22,11 @@ from rapid.networks.blocks import Block
 from rapid.networks.q_network import QNetwork, build_network, set_phase
 from rapid.scenarios import FASTER
 from rapid.simulator import make_vec
-from rapid.training import adapt_by_ppo, ppo
+from rapid.training import adapt_by_ppo, ppo, ppo_learner
 from rapid.training.collector import Collector, Rollout, advantages
 from rapid.training.machinery.diagnostics import Forgetting
 from rapid.training.machinery.worlds import Drive
-from rapid.training.ppo import PpoLearner, without_clock
+from rapid.training.ppo_learner import PpoLearner, without_clock
 
 SCENARIO = "lane-3-density-2"
 PPO = PpoConfig(steps=100, num_envs=3, rollout=8, epochs=2, batch_size=10, critic_steps=24)
@@ -360,13 +360,13 @@ def test_metrics_go_on_where_q_learning_ended(tmp_path: Path):
 def test_what_is_not_finite_stops_it_and_the_last_good_checkpoint_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    loss, count = ppo.policy_gradient_loss, itertools.count(1)
+    loss, count = ppo_learner.policy_gradient_loss, itertools.count(1)
 
     def broken(*arguments: Any):
         return loss(*arguments) * (float("nan") if next(count) == 9 else 1)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ppo, "policy_gradient_loss", broken)
+        patch.setattr(ppo_learner, "policy_gradient_loss", broken)
         with pytest.raises(RapidError, match=r"by update 18 of PPO: a loss or a weight is not finite. Lower"):
             train(tmp_path, checkpoint_seconds=0)
     assert [row["updates"] for row in lines(tmp_path)] == [6, 12]
