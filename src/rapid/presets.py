@@ -77,7 +77,7 @@ STEPS: dict[Plan, dict[Scale, tuple[int, int]]] = {
     "bold": {"tiny": (200, 0), "quick": (30_000, 0), "full": (100_000, 0)},
     "ppo": {"tiny": (200, 7_680), "quick": (30_000, 115_200), "full": (300_000, 700_000)},
     "robust": {"tiny": (0, 7_680), "quick": (0, 153_600), "full": (0, 600_000)},
-    "guided": {"tiny": (200, 7_680), "quick": (30_000, 153_600), "full": (300_000, 921_600)},
+    "guided": {"tiny": (200, 15_360), "quick": (30_000, 153_600), "full": (300_000, 921_600)},
 }
 """Environment steps of phase 3, by Q-learning and then by PPO."""
 DEFAULT_PLAN: dict[Recipe, Plan] = {"paper": "printed", "strong": "bold"}
@@ -357,4 +357,6 @@ def online_baseline(config: Config, algorithm: OnlineBaseline) -> Config:
         # Two rollouts at least: its policy changes between them.
         steps = max(steps, 2 * ppo.num_envs * ppo.rollout)
         adapt = replace(adapt, steps=0, ppo=replace(ppo, steps=steps, critic_steps=0), train="all")
+    # What a guide shows goes by a memory.
+    adapt = replace(adapt, adversary=replace(adapt.adversary, guided=0.0))
     return replace(config, network=network, adapt=adapt)

@@ -19,6 +19,7 @@ from rapid.errors import RapidError
 from rapid.networks.memory import STEPS, initial_state
 from rapid.networks.q_network import QNetwork, with_memory
 from rapid.phases.adapt import adapt_agent, shown_plan
+from rapid.presets import preset
 from rapid.scenarios import FASTER, IDLE, LANE_RIGHT, SLOWER
 from rapid.teacher.scripted import plan_for
 from rapid.training import adapt_by_ppo
@@ -186,6 +187,21 @@ def test_bad_guides_are_refused(tmp_path: Path):
     with pytest.raises(RapidError, match="blind:5,2,4"):
         adapt_agent(replace(usual, adapt=replace(guided, steps=0)), tmp_path / "agent", None, tmp_path / "out")
     assert not (tmp_path / "out" / "ppo").exists()
+
+
+def test_the_plan_guided_adapts_an_agent_on_disk(tmp_path: Path):
+    usual = preset("strong", "tiny", "guided")
+    small = replace(usual.adapt.ppo, steps=480, critic_steps=120, num_envs=8, rollout=15, batch_size=60)
+    config = replace(usual, adapt=replace(usual.adapt, steps=0, ppo=small, evaluate_every=0))
+    validate(config)
+    save_agent(tmp_path / "agent", network(), {"name": "x", "scenario": SCENARIO})
+    agent = adapt_agent(config, tmp_path / "agent", None, tmp_path / "out")
+    assert ["shown" in row for row in lines(tmp_path / "out" / "ppo")] == [False, False, False, True]
+    assert agent.has_memory
+    before, after = network().state_dict(), agent.network.state_dict()
+    frozen = [name for name in before if name.startswith("head.mixture.policies.0.")]
+    assert all(before[name].equal(after[name]) for name in frozen)
+    assert any(not before[name].equal(after[name]) for name in before)
 
 
 def test_the_plan_is_that_of_blind_unless_one_is_named():

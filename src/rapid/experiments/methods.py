@@ -170,7 +170,7 @@ def guided(setting: Setting) -> Adapt:
     It goes on from the agent of that plan that is shipped for the scenario, where one is: all seeds from the same.
     """
     settings = setting.config(plan="guided").adapt
-    steps = GUIDED_STEPS if setting.effort.steps is None else settings.ppo.steps
+    steps = GUIDED_STEPS if setting.effort.steps is None else settings.ppo.steps // 2
     settings = replace(
         settings,
         steps=0,
