@@ -200,6 +200,11 @@ def validate(config: Config) -> Config:
         ),
         (
             "adapt.adversary.guided",
+            adapt.adversary.guided == 0 or adapt.adversary.gradient_share + adapt.adversary.noise_share > 0,
+            "0 where adapt.adversary.gradient_share and noise_share are 0: a plan is shown in attacked episodes",
+        ),
+        (
+            "adapt.adversary.guided",
             adapt.adversary.begin + adapt.adversary.guided <= 1,
             f"at most 1 together with adapt.adversary.begin = {adapt.adversary.begin:g}",
         ),

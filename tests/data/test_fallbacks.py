@@ -142,6 +142,38 @@ def test_what_the_rule_decided_while_the_server_was_gone_is_asked_again(tmp_path
     assert set(dataset.log.column("status").to_pylist()) == {"ok"}
 
 
+def test_so_it_is_where_the_server_is_still_gone_when_it_is_greeted(tmp_path):
+    class Waiting(Unsure):
+        """A teacher that waits for others, and greets them."""
+
+        lost, greetings = 0, ()
+
+        def end_by(self, moment, reason):
+            pass
+
+        def get_ready(self):
+            pass
+
+    class Ending(Waiting):
+        def decide(self, obs_BVF, previous, keys_B):
+            if self.steps > self.down_after:
+                raise MemoryError("the process ends here")
+            return super().decide(obs_BVF, previous, keys_B)
+
+    class Gone(Waiting):
+        def get_ready(self):
+            raise UnreachableError("still gone")
+
+    with pytest.raises(MemoryError):
+        run(tmp_path, Ending(down_after=3), lockstep=4)
+    journal = tmp_path / "collecting" / "journal.jsonl"
+    assert len(journal.read_text().splitlines()) == 1 + 4
+    with pytest.raises(UnreachableError, match="still gone"):
+        run(tmp_path, Gone(), lockstep=4)
+    assert len(journal.read_text().splitlines()) == 1 + 3
+    assert set(run(tmp_path, Waiting(), lockstep=4).log.column("status").to_pylist()) == {"ok"}
+
+
 def test_what_was_kept_never_stops_a_better_model(tmp_path):
     """Of groups so small that they end before a share says anything, also not for ever after."""
     with pytest.raises(TooManyFallbacksError):

@@ -237,3 +237,25 @@ def test_a_projection_has_torchs_gradients_but_for_rounding():
     with compiled_layers(projection):
         for ours, theirs in zip(found(), expected, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
+
+
+def test_what_is_expanded_in_memory_is_read_as_what_it_says():
+    block, _, rows, mask, _, _ = drawn(4, 15, (32, 1, 64))
+    spread = torch.full((1,), 0.5).expand(60, 32)
+    for shown in (rows, spread):
+        kept = shown.clone().requires_grad_()
+        with torch.enable_grad():
+            (expected,) = torch.autograd.grad(block(kept, 15, mask).sum(), kept)
+            with compiled_layers(block):
+                outer = shown.detach().requires_grad_()
+                (found,) = torch.autograd.grad(block(outer, 15, mask).sum(), outer)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_layers_that_were_compiled_before_are_so_afterwards():
+    block = Block(32, 1, 64)
+    with compiled_layers(block):
+        with compiled_layers(block):
+            assert block.compiled
+        assert block.compiled
+    assert not block.compiled

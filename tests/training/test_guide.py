@@ -3,7 +3,7 @@
 import itertools
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -13,12 +13,13 @@ from test_distill import Killed, lines, network, weights
 from test_ppo import PPO, worlds
 
 from rapid.agents.saved import save_agent
-from rapid.config import Config
+from rapid.config import AdaptConfig, Config, NetworkConfig
 from rapid.config_io import validate
 from rapid.errors import RapidError
 from rapid.networks.memory import STEPS, initial_state
-from rapid.networks.q_network import QNetwork, with_memory
-from rapid.phases.adapt import adapt_agent, shown_plan
+from rapid.networks.q_network import QNetwork, build_network, with_memory
+from rapid.phases.adapt import adapt_agent
+from rapid.phases.checks import check, shown_plan
 from rapid.presets import preset
 from rapid.scenarios import FASTER, IDLE, LANE_RIGHT, SLOWER
 from rapid.teacher.scripted import plan_for
@@ -90,7 +91,7 @@ def test_the_policy_learns_from_what_it_sees_what_was_shown_for_the_truth():
         return step(action_W)
 
     drive.step = watched  # pyright: ignore[reportAttributeAccessIssue]
-    rollout = collector.collect(learner, 0.0)
+    rollout = collector.collect(learner, 0, 2)
     assert rollout.shown_NA is not None
     assert rollout.state_NS is not None
     assert collector.guide is not None
@@ -103,7 +104,7 @@ def test_the_policy_learns_from_what_it_sees_what_was_shown_for_the_truth():
     # It leads everywhere at first, so that the plan is driven, and its time ends.
     followed_N = rollout.action_N == rollout.shown_NA.argmax(1)
     assert followed_N[kind != CLEAN].float().mean() > 0.9
-    assert collector.collect(learner, 0.5).shown_NA is None
+    assert collector.collect(learner, 1, 2).shown_NA is None
     assert collector.guide is None
 
 
@@ -132,16 +133,25 @@ def test_after_the_guide_comes_the_return(tmp_path: Path):
     assert ["value" in row for row in rows] == [False, False, True, True]
 
 
-@pytest.mark.parametrize("stop", [4, 9])
+@pytest.mark.parametrize("attention", ["torch", "compiled"])
+@pytest.mark.parametrize("stop", [1, 2, 3])
 def test_a_guided_training_that_was_killed_ends_as_one_that_was_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, attention: Literal["torch", "compiled"]
 ):
+    # The second and the third of four rollouts are guided; the checkpoint before the third holds a guide.
     config = replace(GUIDED, adversary=replace(MIXTURE, begin=0.25, guided=0.5))
+    config = replace(config, ppo=replace(config.ppo, attention=attention))
+
+    def train(directory: Path, config: AdaptConfig, **options: Any) -> QNetwork:
+        # As wide as what is compiled is made for.
+        net = with_memory(build_network(NetworkConfig(width=32, feedforward=32, vehicles=4), 3, 0))
+        return adapt_by_ppo(net, config, SCENARIO, directory, 3, make_worlds=worlds, **options)
+
     whole = train(tmp_path / "whole", config, plan=PLAN)
     count, update = itertools.count(), PpoLearner.update
 
     def dying(self: PpoLearner, *given: Any) -> None:
-        if next(count) == stop // 3:
+        if next(count) == stop:
             raise Killed
         update(self, *given)
 
@@ -182,11 +192,17 @@ def test_bad_guides_are_refused(tmp_path: Path):
         RapidError, match=r"guided' is 0\.5, but must be at most 1 together with adapt\.adversary\.begin"
     ):
         validate(replace(usual, adapt=late))
-    guided = replace(late, adversary=replace(GUIDED.adversary, plan="13,2"))
+    guided = replace(long, memory=True, adversary=replace(GUIDED.adversary, plan="13,2"))
     save_agent(tmp_path / "agent", network(), {"name": "x", "scenario": SCENARIO})
     with pytest.raises(RapidError, match="blind:5,2,4"):
         adapt_agent(replace(usual, adapt=replace(guided, steps=0)), tmp_path / "agent", None, tmp_path / "out")
     assert not (tmp_path / "out" / "ppo").exists()
+    # Before any work of a run, which would collect and distil first.
+    with pytest.raises(RapidError, match="A plan is written 5,2,4"):
+        check(replace(usual, adapt=guided))
+    unattacked = replace(long, memory=True, adversary=replace(GUIDED.adversary, gradient_share=0.0, noise_share=0.0))
+    with pytest.raises(RapidError, match="a plan is shown in attacked episodes"):
+        validate(replace(usual, adapt=unattacked))
 
 
 def test_the_plan_guided_adapts_an_agent_on_disk(tmp_path: Path):

@@ -155,7 +155,7 @@ class Collecting:
             decisions = journal.recall(seen)
             if decisions is None:
                 self._check_budget(len(active))
-                self.spending.get_ready()
+                self._get_ready(journal)
                 keys = np.array([stream_seed(seeds[world], f"step/{step}") for world in active], np.int64)
                 decisions = self._decide(seen, [previous[world] for world in active], keys, journal)
             self._count(decisions)
@@ -188,6 +188,17 @@ class Collecting:
             self._show(len(decisions))
         return self._table(sorted(steps, key=lambda row: row["world"]), seeds, first)
 
+    def _get_ready(self, journal: Journal) -> None:
+        try:
+            self.spending.get_ready()
+        except UnreachableError:
+            self._forget_end(journal)
+            raise
+
+    def _forget_end(self, journal: Journal) -> None:
+        """Forget what the rule decided just before, while the server was already gone: it is asked again."""
+        self.spending.forget(journal.forget_end(lambda decision: decision.unanswered))
+
     def _decide(
         self,
         seen: NDArray[np.float32],
@@ -204,8 +215,7 @@ class Collecting:
                 made = self.teacher.decide(seen[wanted], [previous[place] for place in wanted], keys[wanted])
             except (UnfinishedError, InterruptedDecisions, RefusedError, UnreachableError) as broken_off:
                 if isinstance(broken_off, UnreachableError):
-                    # What the rule decided just before, while the server was already gone, is asked again.
-                    self.spending.forget(journal.forget_end(lambda decision: decision.unanswered))
+                    self._forget_end(journal)
                 self.spending.forget(
                     [decision for decision in broken_off.decisions if decision and decision.unanswered]
                 )

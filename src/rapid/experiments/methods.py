@@ -176,7 +176,7 @@ def guided(setting: Setting) -> Adapt:
         steps=0,
         ppo=replace(settings.ppo, steps=steps, critic_steps=0, attention="compiled"),
         adversary=replace(settings.adversary, begin=0.0, guided=1.0),
-        evaluate_every=steps // CURVE_POINTS,
+        evaluate_every=max(1, steps // CURVE_POINTS),
     )
     shipped_one = f"{setting.scenario}/rapid"
     if shipped_one in shipped_agents():

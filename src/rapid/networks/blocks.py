@@ -113,13 +113,14 @@ def compiled_layers(*networks: nn.Module) -> Generator[None]:
     """Let the layers of some networks be computed by :mod:`rapid.networks.layer` meanwhile."""
     modules = [module for network in networks for module in network.modules()]
     layers = [module for module in modules if isinstance(module, Block | Projection)]
+    before = [each.compiled for each in layers]
     for each in layers:
         each.compiled = True
     try:
         yield
     finally:
-        for each in layers:
-            each.compiled = False
+        for each, was in zip(layers, before, strict=True):
+            each.compiled = was
 
 
 class Transformer(nn.Module):

@@ -107,16 +107,20 @@ def _room(size: int) -> Tensor:
     if len(held) < size:
         held = np.empty(size, np.float32)
     lent = held[:size]
-    weakref.finalize(lent, _spare.append, held).atexit = False
+    if held.nbytes <= MOST_SPARE:
+        weakref.finalize(lent, _spare.append, held).atexit = False
     return torch.from_numpy(lent)
 
 
+MOST_SPARE = 1 << 25
+"""Bytes of the largest memory that is held for the next call: some 2,000 samples of the usual layer."""
 _spare: deque[NDArray[np.float32]] = deque(maxlen=4)
 """Memory that no tensor needs; taking and giving back are safe from several threads."""
 
 
 def _flat(rows: Tensor) -> Tensor:
-    return rows.detach().reshape(-1)
+    # What is expanded, such as the gradient of a sum, is no row of numbers in memory.
+    return rows.detach().reshape(-1).contiguous()
 
 
 class _Layer(torch.autograd.Function):

@@ -8,10 +8,11 @@ from rapid.agents.q_agent import QAgent
 from rapid.agents.saved import load_agent, save_agent
 from rapid.config import Config, without_place
 from rapid.config_io import parts_of, to_dict
-from rapid.config_learning import AdaptConfig, NetworkConfig
+from rapid.config_learning import NetworkConfig
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
 from rapid.networks.q_network import build_network, check_memory, for_lanes, widened, with_memory
+from rapid.phases.checks import shown_plan
 from rapid.phases.data import learnable
 from rapid.phases.measure import learning_curve
 from rapid.presets import OnlineBaseline
@@ -19,7 +20,6 @@ from rapid.progress import task
 from rapid.scenarios import get_scenario, seeing
 from rapid.seeding import stream_seed
 from rapid.simulator import make_vec
-from rapid.teacher.scripted import plan_actions, plan_for, read_plan
 from rapid.tracking import Tracker
 from rapid.training.machinery.diagnostics import Forgetting
 from rapid.training.online import adapt
@@ -48,17 +48,6 @@ def learn_online(config: Config, out: Path, name: str) -> QAgent:
     start = out / "new"
     new_agent(config.network, config.adapt.scenario or config.scenario, config.seed, start)
     return adapt_agent(config, start, None, out, name)
-
-
-def shown_plan(settings: AdaptConfig, scenario: str) -> list[int]:
-    """Return the plan that the policy is shown under attack, if it is to be shown any.
-
-    Raises:
-        RapidError: `blind` has none in this scenario and the settings name none, or none that can be read.
-    """
-    if not settings.adversary.guided:
-        return []
-    return plan_actions(read_plan(settings.adversary.plan) if settings.adversary.plan else plan_for(scenario))
 
 
 def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name: str = "RAPID") -> QAgent:

@@ -6,11 +6,13 @@ from rapid.attacks import get_attack
 from rapid.attacks.suite import expand
 from rapid.config import Config
 from rapid.config_io import validate
+from rapid.config_learning import AdaptConfig
 from rapid.data.collection import parse_shard
 from rapid.engines import check_engine
 from rapid.errors import RapidError
 from rapid.scenarios import get_scenario
 from rapid.teacher import check_teacher
+from rapid.teacher.scripted import plan_actions, plan_for, read_plan
 from rapid.tracking import check_tracking
 
 
@@ -34,4 +36,16 @@ def check(config: Config) -> None:
     parse_shard(config.collect.shard)
     check_engine(config.collect.engine)
     check_tracking(config.tracking)
+    shown_plan(config.adapt, config.adapt.scenario or config.scenario)
     check_teacher(config.teacher, lanes, config.scenario)
+
+
+def shown_plan(settings: AdaptConfig, scenario: str) -> list[int]:
+    """Return the plan that the policy is shown under attack, if it is to be shown any.
+
+    Raises:
+        RapidError: `blind` has none in this scenario and the settings name none, or none that can be read.
+    """
+    if not settings.adversary.guided:
+        return []
+    return plan_actions(read_plan(settings.adversary.plan) if settings.adversary.plan else plan_for(scenario))

@@ -160,7 +160,7 @@ def read_plan(text: str) -> Plan:
     words = [word.strip() for word in text.split(",")]
     if len(words) != 3 or not all(word.isascii() and word.isdigit() for word in words):
         raise RapidError(
-            f"A plan of the driver 'blind' is written blind:5,2,4: how often SLOWER, LANE_RIGHT and FASTER, then IDLE; "
+            f"A plan is written 5,2,4: how often SLOWER, LANE_RIGHT and FASTER, then IDLE; as a driver blind:5,2,4; "
             f"got '{text}'."
         )
     slower, right, faster = map(int, words)

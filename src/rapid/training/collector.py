@@ -106,21 +106,22 @@ class Collector:
         self._rng = numpy_stream(seed, "ppo/exploration")
 
     @torch.no_grad()
-    def collect(self, learner: Policy, done: float = 1.0) -> Rollout:
+    def collect(self, learner: Policy, done: int = 1, planned: int = 1) -> Rollout:
         """Drive every world for `config.rollout` steps and return what there is to learn.
 
         A crash costs `config.crash_penalty` more here than in the return that is reported.
 
         Args:
             learner: who drives.
-            done: the share of the training that is done, by which attacks have grown and exploration has fallen.
+            done: how many rollouts are done, by which attacks have grown and exploration has fallen.
+            planned: how many there will be.
 
         Raises:
             RapidError: an observation or a Q-value is not finite.
         """
         config, device = self.config, self._device
-        guide = self._prepare(done - self.mixture.begin)
-        epsilon = config.exploration * max(1 - 2 * done, 0.0)
+        guide = self._prepare(done, planned)
+        epsilon = config.exploration * max(1 - 2 * done / planned, 0.0)
         obs: list[Tensor] = []
         seen: list[Tensor] = []
         states: list[Tensor] = []
@@ -162,7 +163,9 @@ class Collector:
                 guide.begin(ended_W)
         # After an end comes the next episode, whose first value counts for nothing.
         last_WVF = self._told(self._observed()[0])
-        value_TW = torch.stack([learner.values(told_WVF) for told_WVF in [*obs, last_WVF]])
+        told = [*obs, last_WVF]
+        # From a guide's rollout no critic learns.
+        value_TW = torch.stack([learner.values(each) if guide is None else each.new_zeros(len(each)) for each in told])
         reward_TW, ended_TW = torch.stack(rewards), torch.stack(ended)
         advantage_TW = advantages(reward_TW, value_TW, ended_TW, config.discount, config.trace)
         return Rollout(
@@ -176,16 +179,19 @@ class Collector:
             torch.cat(shown) if shown else None,
         )
 
-    def _prepare(self, after: float) -> Guide | None:
-        """Decide how large attacks are and who shows what to do, so long (share of all steps) after attacks begin."""
-        mixture, guided = self.mixture, self._make_guide is not None
-        ramp = 0.0 if guided else mixture.ramp
+    def _prepare(self, done: int, planned: int) -> Guide | None:
+        """Decide how large attacks are, and who shows what to do, in the rollout after so many of those planned."""
+        mixture, make_guide = self.mixture, self._make_guide
+        after = done / planned - mixture.begin
+        ramp = 0.0 if make_guide else mixture.ramp
         self._size = min(max(after, 0.0) / ramp, 1.0) if ramp else float(after >= 0)
-        if self._make_guide is None or not 0 <= after < mixture.guided:
+        first, last = round(mixture.begin * planned), round((mixture.begin + mixture.guided) * planned)
+        if make_guide is None or not first <= done < last:
             self.guide = None
         else:
-            self.guide = self.guide or self._make_guide()
-            self.guide.left = 1 - after / mixture.guided
+            self.guide = self.guide or make_guide()
+            self.guide.left = (last - done) / (last - first)
+            self._size = 1.0
         return self.guide
 
     def _observed(self) -> tuple[Tensor, Tensor | None]:

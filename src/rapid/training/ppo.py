@@ -126,7 +126,9 @@ def adapt_by_ppo(
         return {"learner": learner.state_dict(), "collector": collector.state_dict(), "rollouts": done}
 
     if (saved := record.resume()) is not None:
-        collector.load_state_dict(saved["collector"])
+        # A guide's copy computes as the network did where it was made.
+        with learner.computing():
+            collector.load_state_dict(saved["collector"])
         learner.load_state_dict(saved["learner"])
         done = saved["rollouts"]
         if progress:
@@ -134,8 +136,9 @@ def adapt_by_ppo(
 
     while done < rollouts:
         with learner.computing():
-            rollout = collector.collect(learner, done / rollouts)
-            learner.update(rollout, collector.guide.left if collector.guide else 1.0)
+            rollout = collector.collect(learner, done, rollouts)
+            guide = collector.guide
+            learner.update(rollout, guide.left if guide else 1.0)
         done += 1
         steps, last = before + done * per_rollout, done == rollouts
         row = {
@@ -143,7 +146,7 @@ def adapt_by_ppo(
             "updates": learner.updates,
             **learner.means(),
             **drive.means(),
-            "learning_rate": learner.learning_rate,
+            "learning_rate": ppo.guide_rate * guide.left if guide else learner.learning_rate,
             "gate": gate_size(network),
             "seconds": record.seconds,
         }
