@@ -10,6 +10,8 @@ machine; at the end it is told whether the weights are the same. Writes `ppo-spe
 """
 
 import argparse
+import importlib
+import importlib.util
 import json
 import os
 import platform
@@ -71,11 +73,13 @@ def compete(plan: str, attack_steps: int, scenario: str, threads: int, attention
     from rapid.networks import q_network
     from rapid.presets import preset
     from rapid.scenarios import get_scenario
-    from rapid.training import ppo_learner as ppo
     from rapid.training.collector import Collector
     from rapid.training.machinery import adam, adversary, worlds
     from rapid.training.machinery.record import network_fingerprint
 
+    # Earlier programs have the learner in the module of the training.
+    place = "ppo_learner" if importlib.util.find_spec("rapid.training.ppo_learner") else "ppo"
+    ppo = importlib.import_module(f"rapid.training.{place}")
     torch.set_num_threads(threads)
     torch.set_flush_denormal(True)
     config, seen = preset("strong", "full", plan), get_scenario(scenario)
@@ -105,7 +109,7 @@ def compete(plan: str, attack_steps: int, scenario: str, threads: int, attention
         start, start_cpu = time.perf_counter(), time.process_time()
         # Earlier programs have no choice of how attention is computed.
         with learner.computing() if hasattr(learner, "computing") else nullcontext():
-            update(collect(learner, 1.0))
+            update(collect(learner, 1))
         whole = {"cpu": time.process_time() - start_cpu, "clock": time.perf_counter() - start}
         steps = settings.num_envs * settings.rollout
         told = {"steps": steps, "seconds": clock.spent | whole, "weights": network_fingerprint(network)}
