@@ -116,7 +116,7 @@ def test_blind_has_a_plan_for_each_scenario_of_the_paper_and_says_so_of_others()
     with pytest.raises(RapidError, match=r"no plan for lane-6-density-2.*rapid.evaluation.blind lane-6-density-2"):
         Scripted("blind", 6, 0, "lane-6-density-2")
     for plan in ("blind:1,2", "blind:1,2,x", "blind:1,2,-3"):
-        with pytest.raises(RapidError, match=r"written blind:5,2,4"):
+        with pytest.raises(RapidError, match=r"as a driver blind:5,2,4"):
             Scripted(plan, 3, 0)
     with pytest.raises(RapidError, match="Unknown scripted driver 'idle:1,2,3'"):
         Scripted("idle:1,2,3", 3, 0)
