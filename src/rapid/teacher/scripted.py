@@ -188,7 +188,8 @@ def plan_for(scenario: str) -> Plan:
     if scenario not in plans:
         raise RapidError(
             f"The driver 'blind' has no plan for {scenario or 'a road without a name'}, only for {', '.join(plans)}. "
-            f"Search one with `python -m rapid.evaluation.blind {scenario or 'SCENARIO'}` and name it: blind:5,2,4."
+            f"Search one with `python -m rapid.evaluation.blind {scenario or 'SCENARIO'}` and name it: "
+            "as a driver blind:5,2,4, as adapt.adversary.plan 5,2,4."
         )
     slower, right, faster = plans[scenario]["plan"]
     return slower, right, faster
