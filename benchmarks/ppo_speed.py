@@ -12,6 +12,7 @@ machine; at the end it is told whether the weights are the same. Writes `ppo-spe
 import argparse
 import importlib
 import importlib.util
+import inspect
 import json
 import os
 import platform
@@ -22,6 +23,7 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -71,8 +73,10 @@ class Clock:
 def compete(plan: str, attack_steps: int, scenario: str, threads: int, attention: str) -> None:
     """Take a rollout for every line of the standard input; tell the seconds of each part, and what the weights are."""
     from rapid.networks import q_network
+    from rapid.phases import adapt as phase
     from rapid.presets import preset
-    from rapid.scenarios import get_scenario
+    from rapid.scenarios import get_scenario, seeing
+    from rapid.simulator import make_vec
     from rapid.training.collector import Collector
     from rapid.training.machinery import adam, adversary, worlds
     from rapid.training.machinery.record import network_fingerprint
@@ -100,7 +104,10 @@ def compete(plan: str, attack_steps: int, scenario: str, threads: int, attention
     adversary.Adversary.__call__ = clock.timed("attack", adversary.Adversary.__call__)
     worlds.Drive.step = clock.timed("simulator", worlds.Drive.step)
     learner = ppo.PpoLearner(network, settings, adapt.optimizer.gate_rate, seen.clock, 0, 10**6)
-    make = worlds.default_worlds(replace(seen, clock=True), network.config.vehicles)
+    timed, rows = replace(seen, clock=True), seeing(network.config.vehicles)
+    # Earlier programs step all worlds in one process, whatever the threads.
+    processes = threads if "processes" in inspect.getsource(phase) else 1
+    make = partial(make_vec, timed, config=rows, processes=processes)
     drive = worlds.Drive(make, settings.num_envs, 0, network.lanes if network.config.memory else None)
     collector = Collector(drive, settings, liar, network.scale_F, 0, "cpu")
     collect, update = clock.timed("driving", collector.collect), clock.timed("forward", learner.update)

@@ -186,7 +186,8 @@ class Config:
     """The seed from which every random stream is derived."""
     threads: Workers = 1
     """Torch threads of this process; scale by processes instead. Another number gives other weights, in their last bits
-    at first. In PPO two or more let policy and critic learn beside each other."""
+    at first. In PPO two or more let policy and critic learn beside each other, and as many processes step its
+    worlds."""
     device: str = "cpu"
     """Torch device."""
     tracking: Literal["none", "tensorboard", "wandb", "trackio"] = "none"

@@ -20,6 +20,7 @@ from rapid.networks.q_network import set_phase, with_memory
 from rapid.phases.adapt import adapt_agent
 from rapid.presets import preset
 from rapid.seeding import numpy_stream
+from rapid.simulator import make_vec
 from rapid.training import adapt_by_ppo
 from rapid.training.collector import Collector
 from rapid.training.machinery.adversary import AWAY, CLEAN, NOISE, TOWARDS, Adversary
@@ -286,3 +287,22 @@ def test_the_plan_robust_adapts_an_agent_on_disk(tmp_path):
     )
     with pytest.raises(RapidError, match="left from right"):
         adapt_agent(mirrored, tmp_path / "out" / "agent", None, tmp_path / "mirrored")
+
+
+def test_as_many_processes_step_the_worlds_as_threads_are_allowed_and_no_weight_differs(tmp_path, monkeypatch):
+    usual = preset("strong", "tiny", "robust")
+    small = replace(usual.adapt.ppo, steps=480, critic_steps=240, num_envs=8, batch_size=60)
+    save_agent(tmp_path / "distilled", network(), {"scenario": SCENARIO})
+    asked: list[int] = []
+
+    def counted(*given, processes=1, **named):
+        asked.append(processes)
+        return make_vec(*given, processes=processes, **named)
+
+    monkeypatch.setattr("rapid.phases.adapt.make_vec", counted)
+    found = []
+    for threads in (1, 2):
+        config = replace(usual, threads=threads, adapt=replace(usual.adapt, ppo=small, evaluate_every=0))
+        found.append(weights(adapt_agent(config, tmp_path / "distilled", None, tmp_path / f"{threads}").network))
+    assert asked == [1, 2]
+    assert found[0] == found[1]

@@ -103,6 +103,8 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
             if settings.memory:
                 network = for_lanes(with_memory(network), lanes)
             timed = replace(get_scenario(scenario), clock=True)
+            # As many processes step the worlds as the learner may use threads.
+            processes = config.threads if config.simulator == "compiled" else 1
             adapt_by_ppo(
                 network,
                 settings,
@@ -112,7 +114,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 forgetting=forgetting,
                 evaluate=evaluate,
                 progress=work,
-                make_worlds=lambda count: make_vec(timed, count, config.simulator, config=seen),
+                make_worlds=lambda count: make_vec(timed, count, config.simulator, config=seen, processes=processes),
                 track=tracker.log,
                 plan=plan,
             )
