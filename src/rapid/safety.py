@@ -29,13 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
+from rapid.road import CAR_LENGTH, LANE_WIDTH, RANGES, SIGHT
 from rapid.scenarios import FASTER, IDLE, NUM_ACTIONS, NUM_FEATURES, SLOWER, TARGET_SPEEDS
 
-LANE_WIDTH, CAR_LENGTH = 4.0, 5.0
-ALONG, ACROSS, SPEEDS = 200.0, LANE_WIDTH, 80.0
-"""What a radius of 1 means: metres along the road, metres across it for each lane, m/s (highway-env's ranges)."""
-SIGHT = 200.0
-"""Metres along the road within which cars are observed."""
 SPEED_STEP, TOP_SPEED = TARGET_SPEEDS[1] - TARGET_SPEEDS[0], TARGET_SPEEDS[-1]
 LAG = 0.6
 """Seconds: the ego accelerates by (target speed - speed) / LAG."""
@@ -97,7 +93,8 @@ def read_box(text: str, lanes: int) -> Box:
     if comma:
         return Box(values[0], values[0], values[1])
     (radius,) = values
-    return Box(ALONG * radius, ACROSS * lanes * radius, SPEEDS * radius)
+    along, across, speed = RANGES
+    return Box(along * radius, across * lanes * radius, speed * radius)
 
 
 class IntervalFilter:

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 from urllib.parse import quote, unquote
 
 from rapid.errors import RapidError, did_you_mean
+from rapid.road import RANGES
 
 Kind = Literal[
     "none",
@@ -32,11 +33,6 @@ Norm = Literal["linf", "l2"]
 Loss = Literal["ce", "margin", "dlr", "min-q", "mad"]
 Target = Literal["faster", "idle", "sideways", "slower"]
 Lie = Literal["far", "near", "left", "right", "drawn"]
-
-LANE_WIDTH = 4.0
-"""Metres."""
-RANGES = (200.0, LANE_WIDTH, 80.0)
-"""What 1 means in a normalised feature: metres along, metres across for each lane, m/s (highway-env's own ranges)."""
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
 from rapid.files import atomic_path
+from rapid.road import CAR_LENGTH
 from rapid.scenarios import ACTIONS, PROGRESS_CRASH, PROGRESS_SPEED
 
 Kind = Literal["floor", "teacher", "planner", "learned"]
 """What kind of agent: needs no learning, a teacher, search in the simulator, or learned."""
 
-VEHICLE_LENGTH = 5.0
-"""Metres, bumper to bumper, of every vehicle on the road."""
 SAME_LANE = 2.0
 """Metres of lateral distance within which another vehicle is on the ego's own lane: half a lane's width."""
 
@@ -166,7 +165,7 @@ def time_to_collision(obs_BVF: NDArray[np.floating]) -> NDArray[np.float64]:
     distance = np.where(leads, ahead, np.inf)
     lead = distance.argmin(1)
     world = np.arange(len(obs))
-    gap = np.maximum(distance[world, lead] - VEHICLE_LENGTH, 0.0)
+    gap = np.maximum(distance[world, lead] - CAR_LENGTH, 0.0)
     closing = ego[:, 0, 3] - others[world, lead, 3]
     ttc = np.full(len(obs), np.inf)
     meets = np.isfinite(gap) & ((closing > 0) | (gap == 0))

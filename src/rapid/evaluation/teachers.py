@@ -20,10 +20,11 @@ import rapid
 from rapid.agents.open import Driver, Said, driver_for
 from rapid.data.tables import read_parquet
 from rapid.errors import RapidError
-from rapid.evaluation.metrics import SAME_LANE, VEHICLE_LENGTH, time_to_collision
+from rapid.evaluation.metrics import SAME_LANE, time_to_collision
 from rapid.evaluation.recording import Recording
 from rapid.evaluation.worlds import Perturbation, Worlds
 from rapid.files import atomic_path
+from rapid.road import CAR_LENGTH
 from rapid.scenarios import LANE_LEFT, LANE_RIGHT, get_scenario
 from rapid.simulator import Simulator
 from rapid.teacher.decision import Decision
@@ -272,7 +273,7 @@ def time_headway(obs_BVF: NDArray[np.floating]) -> NDArray[np.float64]:
     ahead = others[..., 1] - ego[:, None, 1]
     leads = (others[..., 0] > 0.5) & (np.abs(others[..., 2] - ego[:, None, 2]) <= SAME_LANE) & (ahead > 0)
     distance = np.where(leads, ahead, np.inf).min(1, initial=np.inf)
-    gap = np.maximum(distance - VEHICLE_LENGTH, 0.0)
+    gap = np.maximum(distance - CAR_LENGTH, 0.0)
     headway = np.minimum(gap / np.maximum(ego[:, 3], 1e-6), LONGEST_HEADWAY)
     return np.where(np.isfinite(distance), headway, np.nan)
 

@@ -8,9 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from rapid.road import LANE_WIDTH, RANGES
 from rapid.scenarios import NUM_FEATURES, NUM_VEHICLES
 
-LANE_WIDTH = 4.0
 """Metres."""
 EGO_UNITS = (1.0, 50.0, LANE_WIDTH, 10.0, 5.0)
 """The units of ego-relative features: 50 m along the road, one lane, 10 m/s along, 5 m/s across."""
@@ -32,7 +32,8 @@ def feature_scale(lanes: int) -> Tensor:
 
     These are the ranges by which highway-env itself normalises observations of a road with `lanes` lanes.
     """
-    return torch.tensor([1.0, 200.0, LANE_WIDTH * lanes, 80.0, 80.0])
+    along, across, speed = RANGES
+    return torch.tensor([1.0, along, across * lanes, speed, speed])
 
 
 def normalize(obs_BVF: Tensor, scale_F: Tensor) -> Tensor:

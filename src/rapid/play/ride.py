@@ -17,11 +17,12 @@ from rapid.evaluation.summary import label_of
 from rapid.evaluation.worlds import Perturbation
 from rapid.pages.episodes import frame, rounded, seen
 from rapid.play.roster import You
+from rapid.road import RANGES
 from rapid.safety import IntervalFilter
 from rapid.scenarios import ACTIONS, MAX_VEHICLES, NUM_ACTIONS, NUM_VEHICLES, get_scenario, seeing
 from rapid.teacher.decision import answer_in_words, computed_in_words
 
-ALONG = 200.0
+ALONG = RANGES[0]
 """What 1 means along the road, metres, in the features by which attacks are sized."""
 MOST_METRES = 60.0
 """The largest attack that the page asks for, metres along the road."""

@@ -10,9 +10,10 @@ import math
 
 import numpy as np
 
+from rapid.road import CAR_LENGTH, LANE_WIDTH
 from rapid.scenarios import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER
 from rapid.simulator.compile import dot, kernel
-from rapid.simulator.spawn import LANE_WIDTH, nearest_speed_index
+from rapid.simulator.spawn import nearest_speed_index
 from rapid.simulator.state import (
     ACCELERATION,
     AHEAD,
@@ -40,7 +41,6 @@ from rapid.simulator.state import (
 
 ROAD_LENGTH = 10_000.0
 SPEED_LIMIT = 30.0
-VEHICLE_LENGTH = 5.0
 HALF_LENGTH = 2.5
 
 SPEED_GAIN = 1 / 0.6
@@ -88,14 +88,14 @@ def clip(value, low, high):
 def on_lane(cars, j, lane):
     """Whether neighbours searching `lane` see vehicle `j`."""
     x = cars[X, j]
-    return abs(cars[Y, j] - LANE_WIDTH * lane) <= REACH and -VEHICLE_LENGTH <= x < ROAD_LENGTH + VEHICLE_LENGTH
+    return abs(cars[Y, j] - LANE_WIDTH * lane) <= REACH and -CAR_LENGTH <= x < ROAD_LENGTH + CAR_LENGTH
 
 
 @kernel
 def reachable(cars, i, lane):
     """Whether vehicle `i` is close enough to change to `lane`."""
     x = cars[X, i]
-    return abs(cars[Y, i] - LANE_WIDTH * lane) <= 2 * LANE_WIDTH and 0.0 <= x < ROAD_LENGTH + VEHICLE_LENGTH
+    return abs(cars[Y, i] - LANE_WIDTH * lane) <= 2 * LANE_WIDTH and 0.0 <= x < ROAD_LENGTH + CAR_LENGTH
 
 
 @kernel

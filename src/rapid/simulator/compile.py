@@ -21,11 +21,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @cache
 def kernel_stamp() -> bytes:
-    """Return a digest of every file of RAPID that holds a kernel."""
+    """Return a digest of every file of RAPID that holds a kernel, or numbers that kernels read."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         source = path.read_bytes()
-        if b"@kernel" in source:
+        if b"@kernel" in source or path.name == "road.py":
             digest.update(path.name.encode() + b"\0" + source)
     return digest.digest()
 

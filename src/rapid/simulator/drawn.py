@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rapid.simulator.observation import SIGHT
+from rapid.road import LANE_WIDTH, SIGHT
 from rapid.simulator.reconstruct import LATERAL_TIME, reconstruct
 from rapid.simulator.settings import Settings
-from rapid.simulator.spawn import LANE_WIDTH, TRAFFIC_START_SPEED
+from rapid.simulator.spawn import TRAFFIC_START_SPEED
 from rapid.simulator.state import CAR_ROWS, ORDER, RANK, TAG_ROWS, WORLD_ENTRIES, X
 
 Worlds = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]

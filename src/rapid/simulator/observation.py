@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from rapid.simulator.behavior import ROAD_LENGTH, VEHICLE_LENGTH, clip, wrap_angle
+from rapid.road import CAR_LENGTH, LANE_WIDTH, SIGHT
+from rapid.simulator.behavior import ROAD_LENGTH, clip, wrap_angle
 from rapid.simulator.compile import dot, kernel
-from rapid.simulator.spawn import LANE_WIDTH
 from rapid.simulator.state import (
     COS,
     CRASHED,
@@ -24,8 +24,6 @@ from rapid.simulator.state import (
     X,
     Y,
 )
-
-SIGHT = 200.0
 
 # Columns of the info matrix that the step fills.
 INFO_SPEED, INFO_LANE, INFO_DISTANCE, INFO_CRASHED, INFO_COLLISION, INFO_RIGHT, INFO_FAST, INFO_ON_ROAD = range(8)
@@ -89,7 +87,7 @@ def observe(cars, tags, world, settings, observation):
         ahead, aside = cars[X, j] - cars[X, 0], cars[Y, j] - cars[Y, 0]
         if math.sqrt(dot(ahead, aside, ahead, aside)) >= SIGHT:
             continue
-        if not settings.see_behind and ahead <= -2 * VEHICLE_LENGTH:
+        if not settings.see_behind and ahead <= -2 * CAR_LENGTH:
             continue
         distance = abs(ahead)
         if count == room and distance >= distances[room - 1]:
@@ -114,7 +112,7 @@ def observe(cars, tags, world, settings, observation):
 def reward(cars, tags, settings, info):
     """Return the reward of the state that one world is in, and write its terms into `info` (INFO_COLUMNS values)."""
     x, y, lane = cars[X, 0], cars[Y, 0], tags[LANE, 0]
-    on_road = abs(y - LANE_WIDTH * lane) <= LANE_WIDTH / 2 and -VEHICLE_LENGTH <= x < ROAD_LENGTH + VEHICLE_LENGTH
+    on_road = abs(y - LANE_WIDTH * lane) <= LANE_WIDTH / 2 and -CAR_LENGTH <= x < ROAD_LENGTH + CAR_LENGTH
     forward = cars[SPEED, 0] * cars[COS, 0]
     pace = (forward - settings.reward_low_speed) / (settings.reward_high_speed - settings.reward_low_speed)
     info[INFO_COLLISION] = 1.0 if tags[CRASHED, 0] else 0.0

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from rapid.simulator.behavior import VEHICLE_LENGTH
+from rapid.road import CAR_LENGTH, LANE_WIDTH
 from rapid.simulator.compile import kernel
 from rapid.simulator.dynamics import sort_by_x
-from rapid.simulator.spawn import LANE_WIDTH, nearest_speed_index
+from rapid.simulator.spawn import nearest_speed_index
 from rapid.simulator.state import (
     COS,
     EXPONENT,
@@ -87,6 +87,6 @@ def closeness(cars, tags):
         front, rear = (j, 0) if cars[X, j] >= cars[X, 0] else (0, j)
         closing = max(cars[SPEED, rear] - cars[SPEED, front], 0.0)
         wanted = STANDSTILL_GAP + GAP_TIME * cars[SPEED, rear] + closing * closing / (2 * BRAKING)
-        gap = cars[X, front] - cars[X, rear] - VEHICLE_LENGTH
+        gap = cars[X, front] - cars[X, rear] - CAR_LENGTH
         worst = max(worst, (wanted - gap) / wanted)
     return min(worst, 1.0)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
+from rapid.road import LANE_WIDTH
 from rapid.simulator.settings import Settings, read_integer
 from rapid.simulator.state import (
     COS,
@@ -39,7 +40,6 @@ GLASS: Color = (38, 42, 50)
 SIGNAL: Color = (255, 140, 26)
 HEADER: Color = (30, 33, 39)
 
-LANE_WIDTH = 4.0
 LENGTH, WIDTH = 5.0, 2.0
 VERGE = 2.5
 """Metres of grass beside the road."""

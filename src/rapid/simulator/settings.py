@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError, did_you_mean
+from rapid.road import LANE_WIDTH, SIGHT
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER, Dynamics
 
 IDM = "highway_env.vehicle.behavior.IDMVehicle"
@@ -69,9 +70,7 @@ _OBSERVATION_KEYS = (
 )
 _ACTION_KEYS = ("type", "longitudinal", "lateral", "target_speeds")
 _DEFAULT_TARGET_SPEEDS = (20.0, 25.0, 30.0)
-_SIGHT = 200.0
 _TOP_SPEED = 40.0
-_LANE_WIDTH = 4.0
 
 USE_REFERENCE = 'Make the environment with simulator="highway-env" to run it as it is.'
 
@@ -230,9 +229,9 @@ def _read_observation(observation: Any, lanes: int) -> dict[str, Any]:
         raise RapidError(f"observation.features names a feature twice: {names}. Name each once.")
     ranges: dict[str, tuple[float, float]] = {}
     if _flag(observation, "normalize", True):
-        road = _LANE_WIDTH * lanes
+        road = LANE_WIDTH * lanes
         given = observation.get("features_range") or {
-            "x": [-_SIGHT, _SIGHT],
+            "x": [-SIGHT, SIGHT],
             "y": [-road, road],
             "vx": [-2 * _TOP_SPEED, 2 * _TOP_SPEED],
             "vy": [-2 * _TOP_SPEED, 2 * _TOP_SPEED],

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from rapid.road import LANE_WIDTH, START_SPEED
 from rapid.simulator.compile import kernel
 from rapid.simulator.state import (
     ACCELERATION,
@@ -37,8 +38,6 @@ from rapid.simulator.state import (
 )
 from rapid.simulator.stream import integer_below, uniform
 
-LANE_WIDTH = 4.0
-EGO_START_SPEED = 25.0
 TRAFFIC_START_SPEED = (0.7 * 30.0, 0.8 * 30.0)
 
 
@@ -62,7 +61,7 @@ def spawn_world(cars, tags, world, stream, settings):
             lane = settings.initial_lane
         else:
             lane = integer_below(stream, settings.lanes)
-        speed = EGO_START_SPEED if i == 0 else uniform(stream, TRAFFIC_START_SPEED[0], TRAFFIC_START_SPEED[1])
+        speed = START_SPEED if i == 0 else uniform(stream, TRAFFIC_START_SPEED[0], TRAFFIC_START_SPEED[1])
         spacing = settings.ego_spacing if i == 0 else settings.traffic_spacing
         gap = spacing * (12.0 + speed) * settings.spacing_factor
         if i == 0:
@@ -90,7 +89,7 @@ def spawn_world(cars, tags, world, stream, settings):
         tags[PUSHED, i] = 0
         tags[ORDER, i] = i
         tags[RANK, i] = i
-    index = nearest_speed_index(EGO_START_SPEED, settings.target_speeds)
+    index = nearest_speed_index(START_SPEED, settings.target_speeds)
     cars[TARGET_SPEED, 0] = settings.target_speeds[index]
     world[TIME] = 0.0
     world[START_X] = cars[X, 0]

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid.road import LANE_WIDTH
 from rapid.simulator.behavior import (
     LANE_CHANGE_DELAY,
     MAX_BRAKING_IMPOSED,
@@ -20,7 +21,6 @@ from rapid.simulator.behavior import (
 )
 from rapid.simulator.dynamics import DIAGONAL, collide, interval_distance, move, normal, sort_by_x, span
 from rapid.simulator.settings import Settings
-from rapid.simulator.spawn import LANE_WIDTH
 from rapid.simulator.state import (
     CRASHED,
     EXPONENT,

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
+from rapid.road import CAR_LENGTH, LANE_WIDTH
 from rapid.scenarios import ACTIONS, FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
-from rapid.simulator.behavior import ROAD_LENGTH, VEHICLE_LENGTH, reachable
+from rapid.simulator.behavior import ROAD_LENGTH, reachable
 from rapid.simulator.settings import USE_REFERENCE, Settings
-from rapid.simulator.spawn import LANE_WIDTH
 from rapid.simulator.state import (
     COS,
     CRASHED,
@@ -117,7 +117,7 @@ class VehicleView:
         """Whether its centre is on its lane."""
         x, y = self.position
         aside = abs(y - LANE_WIDTH * self._tags[LANE, self._index])
-        return bool(aside <= LANE_WIDTH / 2 and -VEHICLE_LENGTH <= x < ROAD_LENGTH + VEHICLE_LENGTH)
+        return bool(aside <= LANE_WIDTH / 2 and -CAR_LENGTH <= x < ROAD_LENGTH + CAR_LENGTH)
 
     @property
     def _cars(self) -> NDArray[np.float64]:

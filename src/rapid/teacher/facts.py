@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
+from rapid.road import CAR_LENGTH
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, SLOWER
 from rapid.teacher.forecast import Forecast, forecast
 from rapid.teacher.foresight import DEPTH, WayOn, look_ahead
-from rapid.teacher.scene import CAR_LENGTH, Car, Scene
+from rapid.teacher.scene import Car, Scene
 
 MINIMUM_GAP = 2.0
 """Metres, bumper to bumper, below which no check passes."""

@@ -12,8 +12,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid.road import CAR_LENGTH, CAR_WIDTH, LANE_WIDTH
 from rapid.scenarios import NUM_ACTIONS
-from rapid.teacher.scene import CAR_LENGTH, CAR_WIDTH, LANE_WIDTH, LATERAL_TIME, Scene
+from rapid.teacher.scene import LATERAL_TIME, Scene
 
 HORIZON = 4.0
 """Seconds looked ahead."""

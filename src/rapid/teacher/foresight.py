@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rapid.road import LANE_WIDTH
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, NUM_ACTIONS, NUM_VEHICLES, SLOWER, Scenario
 from rapid.simulator.compile import kernel
 from rapid.simulator.configuration import merge_config
@@ -27,7 +28,7 @@ from rapid.simulator.settings import Settings, read_settings
 from rapid.simulator.spawn import nearest_speed_index
 from rapid.simulator.state import CAR_ROWS, RANK, SPEED, TAG_ROWS, TARGET_LANE, WORLD_ENTRIES, X
 from rapid.simulator.step import step_world
-from rapid.teacher.scene import LANE_WIDTH, Scene
+from rapid.teacher.scene import Scene
 
 DEPTH = 6
 """Decisions, and so seconds, looked ahead, the action included."""

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from rapid.config import TeacherConfig
 from rapid.errors import RapidError
+from rapid.road import CAR_LENGTH
 from rapid.teacher.decision import Decision
 from rapid.teacher.experience import Experience, read_experiences, to_lines
 from rapid.teacher.facts import Facts
 from rapid.teacher.prompt import WORDS, outcome
-from rapid.teacher.scene import CAR_LENGTH, Car, Scene
+from rapid.teacher.scene import Car, Scene
 from rapid.teacher.tools import describe_car
 
 FAR = 100.0

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
+from rapid.road import LANE_WIDTH, SIGHT
 from rapid.scenarios import (
     FASTER,
     FEATURES,
@@ -23,12 +24,6 @@ from rapid.scenarios import (
     TARGET_SPEEDS,
 )
 from rapid.simulator.reconstruct import LATERAL_TIME
-
-LANE_WIDTH = 4.0
-CAR_LENGTH = 5.0
-CAR_WIDTH = 2.0
-SIGHT = 200.0
-"""Metres beyond which the simulator shows no car; rows that claim more are not believed."""
 
 
 @dataclass(frozen=True)

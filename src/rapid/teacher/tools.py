@@ -4,10 +4,11 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+from rapid.road import CAR_LENGTH
 from rapid.scenarios import IDLE, LANE_LEFT, LANE_RIGHT
 from rapid.teacher.facts import Facts
 from rapid.teacher.prompt import WORDS, outcome
-from rapid.teacher.scene import CAR_LENGTH, Car
+from rapid.teacher.scene import Car
 
 ALIASES = {word: action for action, word in WORDS.items()} | {
     "lane_left": LANE_LEFT,
