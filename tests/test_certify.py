@@ -140,7 +140,9 @@ def remembering(**settings: Any) -> QAgent:
     return agent
 
 
-@pytest.mark.parametrize("settings", [{}, {"action_token": "ego", "num_policies": 3, "top_k": 2}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"action_token": "ego", "num_policies": 3, "top_k": 2}, {"squeeze": True}], ids=str
+)
 def test_bounds_hold_through_a_memory_whose_state_is_known(roads: Any, settings: dict[str, Any]):
     agent, scale = remembering(**settings), feature_scale(3) * torch.tensor([0.0, 1, 1, 1, 1])
     obs, bounds = roads(4, absent=0.4)[:, :6], Bounds(agent.network)
@@ -152,6 +154,8 @@ def test_bounds_hold_through_a_memory_whose_state_is_known(roads: Any, settings:
     place = _memory_of(agent).start_x + state[0, DISTANCE]
     obs[:, 0, 1] = place + torch.tensor([5.5, -5.5 - 0.4 * 3, 0.0, 30.0])
     obs[:, 0, 3] = state[0, SPEED] - torch.tensor([0.0, 1.5, 0.5, 8.0])
+    # One car just where its lane is rounded, so that it is read as on either.
+    obs[1, 1, 0], obs[1, 1, 2] = 1, 2.0
     q = agent.network(obs, state).double()
     exact = bounds.differences(obs, obs, state)
     assert torch.allclose(exact, q[:, :, None] - q[:, None], atol=2e-5)

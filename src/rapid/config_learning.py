@@ -68,6 +68,9 @@ class NetworkConfig:
     memory: bool = False
     """Give it a memory of what a car knows by itself: the time, its own speed and lanes, dead-reckoned from its own
     actions, which no attack on observations moves. For networks of tokens that do not average with the mirror image."""
+    squeeze: bool = False
+    """With a memory: read nothing that an attack within 0.1 could bend far. Of the others that is where along the road
+    and on which lane they are, of the ego which lane; its place and speed are those it remembers."""
     shield: str = ""
     """Behind the Q-values, the interval filter (`rapid.safety`) that lets an action pass only if it is safe in every
     true state within this of what is seen: a radius such as 0.1, or metres and m/s such as 1m,0.5; nothing is none."""
@@ -292,6 +295,8 @@ class AdaptConfig:
     """Set `network.mirror` from this phase on; without this an agent keeps what it has."""
     memory: bool = False
     """Set `network.memory` from PPO on; without this an agent keeps what it has."""
+    squeeze: bool = False
+    """Set `network.squeeze` from PPO on, beside a memory; without this an agent keeps what it has."""
     shield: str = ""
     """Set `network.shield` from this phase on, so that the policy learns behind the filter; nothing leaves it as it
     is."""

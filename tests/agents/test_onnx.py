@@ -171,7 +171,8 @@ def test_missing_files_and_packages_are_explained(roads, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"kind": "attentive"}, {"action_token": "ego", "gate": "tanh"}, {"num_policies": 3}]
+    "settings",
+    [{}, {"kind": "attentive"}, {"action_token": "ego", "gate": "tanh"}, {"num_policies": 3}, {"squeeze": True}],
 )
 def test_a_memory_is_exported_with_the_agent(settings, tmp_path):
     agent = opened(make(memory=True, **settings))
@@ -181,6 +182,7 @@ def test_a_memory_is_exported_with_the_agent(settings, tmp_path):
     obs, state = driven_observations(agent, "lane-3-density-2", seeds)
     # As if it were attacked: what is believed of the ego is bounded in the model as well.
     obs[::2, 0, 1:4] += np.array([20, 1, -8], np.float32)
+    obs[::3, 1:, 2:] += np.array([-5, 8, -8], np.float32)
     path = tmp_path / "it.onnx"
     parity = export_onnx(agent, path, obs, state)
     assert parity.observations == len(obs) > 24

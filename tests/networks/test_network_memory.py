@@ -148,6 +148,54 @@ def test_an_attack_on_the_ego_is_bounded_by_what_is_known_of_it(observations):
     assert ((believed[:, 1:, 1] - believed[:, :1, 1]) - (observations[:, 1:, 1] - observations[:, :1, 1]) > 9).all()
 
 
+@pytest.mark.parametrize("lanes", [3, 4])
+def test_of_squeezed_features_an_attack_moves_nothing_but_where_along_the_road_the_others_are(lanes):
+    env, rng = make_vec(f"lane-{lanes}-density-2", 16), np.random.default_rng(0)
+    obs, state = env.reset(seed=list(range(16)))[0], initial_state(16, lanes)
+    network = used(with_memory(build_network(NetworkConfig(), lanes, 3), squeeze=True))
+    scale = feature_scale(lanes)
+    moved = 0
+    for _ in range(12):
+        true, remembered = torch.from_numpy(np.array(obs)), torch.from_numpy(state)
+        centred = (true[..., 2] / 4 - (true[..., 2] / 4).round()).abs() < 0.05
+        offsets = torch.from_numpy(rng.uniform(-0.1, 0.1, true.shape).astype(np.float32)) * scale
+        offsets[..., 2] *= centred
+        # Most of them at the edge, where an attack ends.
+        offsets = torch.where(torch.rand(offsets.shape) < 0.8, offsets.sign() * scale * 0.1 * (offsets != 0), offsets)
+        seen = true + offsets
+        before, after = (network.memory.squeezed(each, remembered) for each in (true, seen))
+        assert torch.equal(after[:, 0, 1:], before[:, 0, 1:])
+        assert torch.equal(after[:, 1:, 2:], before[:, 1:, 2:])
+        assert torch.equal(after[:, 1:, :2], seen[:, 1:, :2])
+        assert torch.equal(network.memory.knowledge(seen, remembered), network.memory.knowledge(true, remembered))
+        seen[:, 1:, 1] = true[:, 1:, 1]
+        seen[..., 0] = true[..., 0]
+        assert torch.equal(network(seen, remembered), network(true, remembered))
+        moved += int((seen != true).sum())
+        # What is read is true of who is in the middle of its lane.
+        present = (true[..., 0] > 0.5) & centred
+        assert torch.allclose(before[..., 2][present], true[..., 2][present], atol=0.25)
+        chosen = rng.integers(5, size=16)
+        obs, _, terminated_W, truncated_W, _ = env.step(chosen)
+        state = next_state(state, chosen, lanes)
+        state[terminated_W | truncated_W] = initial_state(1, lanes)
+    assert moved > 1000
+
+
+def test_squeezed_features_by_hand_and_what_their_gradient_is():
+    network = with_memory(build_network(NetworkConfig(vehicles=5), LANES, 3), squeeze=True)
+    state = torch.tensor([[2.0, 5, 20.5, 1, 2, 44]])
+    rows = [[1.0, 7, 0.4, 3, 3], [1, 250, 2.1, 30, 1], [1, 300, -9, 0, 0], [1, 300, 30, 0, 0], [0.0, 0, 0, 0, 0]]
+    obs = torch.tensor([rows], requires_grad=True)
+    squeezed = network.memory.squeezed(obs, state)
+    start = network.memory.start_x
+    expected = [[1.0, start + 44, 4, 20.5, 0], [1, 250, 4, 21, 0], [1, 300, 0, 21, 0], [1, 300, 8, 21, 0], [0.0] * 5]
+    assert torch.equal(squeezed[0], torch.tensor(expected))
+    (gradient,) = torch.autograd.grad(squeezed.sum(), obs)
+    # It passes through the rounding of y, and is none where nothing is read.
+    assert gradient[0].tolist() == [[1, 0, 1, 0, 0], *[[1, 1, 1, 0, 0]] * 4]
+
+
 def test_policy_1_never_hears_it(observations):
     network = used(with_memory(build_network(NetworkConfig(), LANES, 3)))
     state = torch.from_numpy(initial_state(8, LANES))
@@ -166,6 +214,14 @@ def test_policy_1_never_hears_it(observations):
 
 def test_it_is_saved_and_loaded(tmp_path, observations):
     network = used(with_memory(build_network(NetworkConfig(), LANES, 3)))
+    squeezing = used(with_memory(network, squeeze=True))
+    save_agent(tmp_path / "squeezing", squeezing, {"name": "that"})
+    other, first = load_agent(tmp_path / "squeezing"), torch.from_numpy(initial_state(8, LANES))
+    moved = observations + torch.tensor([0, 0, 1.0, 5, 5])
+    with torch.no_grad():
+        expected = squeezing(moved, first)
+        assert torch.equal(other.network(moved, first), expected)
+        assert not torch.equal(network(moved, first), expected)
     save_agent(tmp_path, network, {"name": "it"})
     agent = load_agent(tmp_path)
     assert remembers(agent)
@@ -187,5 +243,7 @@ def test_what_does_not_fit_is_refused(observations):
         network(observations, torch.from_numpy(initial_state(8, LANES)))
     with pytest.raises(RapidError, match="no tokens that a memory could speak to"):
         with_memory(build_network(NetworkConfig(kind="mlp"), LANES, 3))
+    with pytest.raises(RapidError, match="Set memory as well, or unset squeeze"):
+        build_network(NetworkConfig(squeeze=True), LANES, 3)
     with pytest.raises(RapidError, match="left from right, the mirror does not"):
         build_network(NetworkConfig(memory=True, mirror=True), LANES, 3)

@@ -27,8 +27,10 @@ from rapid.networks.memory import (
     START_TOLERANCE,
     STATE_SIZE,
     STEPS,
+    TRAFFIC_SPEED,
     Memory,
 )
+from rapid.road import LANE_WIDTH
 from rapid.scenarios import FASTER, LANE_LEFT, LANE_RIGHT, NUM_FEATURES, SLOWER, TARGET_SPEEDS
 
 FREE = 1e30
@@ -45,7 +47,9 @@ class Names(NamedTuple):
 
 
 def believed(graph: Graph, memory: Memory, obs: str, state: str) -> str:
-    """Return the observations with the ego's row within what is known of it."""
+    """Return the observations with the ego's row within what is known of it, or with all rows squeezed."""
+    if memory.squeeze:
+        return _squeezed(graph, memory, obs, state)
     low_SF, high_SF = np.zeros((STATE_SIZE, NUM_FEATURES)), np.zeros((STATE_SIZE, NUM_FEATURES))
     low_F, high_F = np.full(NUM_FEATURES, -FREE), np.full(NUM_FEATURES, FREE)
     low_SF[DISTANCE, X] = high_SF[DISTANCE, X] = 1
@@ -66,10 +70,13 @@ def recalled(graph: Graph, memory: Memory, obs: str, state: str) -> Names:
     state_SK, ego_FK = np.zeros((STATE_SIZE, 6)), np.zeros((NUM_FEATURES, 6))
     state_SK[SPEED, 0] = 1 / TARGET_SPEEDS[-1]
     state_SK[LEFTMOST, 1] = state_SK[RIGHTMOST, 2] = 1 / most
-    state_SK[SPEED, 4], ego_FK[VX, 4] = -1 / 4, 1 / 4
-    state_SK[DISTANCE, 5], ego_FK[X, 5] = -1 / 20, 1 / 20
+    start = 0.0
+    if not memory.squeeze:
+        state_SK[SPEED, 4], ego_FK[VX, 4] = -1 / 4, 1 / 4
+        state_SK[DISTANCE, 5], ego_FK[X, 5] = -1 / 20, 1 / 20
+        start = -memory.start_x / 20
     ego = graph.reshape(graph.cut(obs, 0, 1, 1), -1, NUM_FEATURES)
-    numbers = _affine(graph, state, state_SK, np.array([0, 0, 0, 0, 0, -memory.start_x / 20]))
+    numbers = _affine(graph, state, state_SK, np.array([0, 0, 0, 0, 0, start]))
     numbers = graph.node("Add", numbers, _affine(graph, ego, ego_FK, np.zeros(6)))
     seen = graph.number(graph.node("Greater", graph.cut(obs, 0, 1, 2), 0.5))
     present = graph.node("ReduceSum", seen, graph.constant([1, 2], np.int64), keepdims=0)
@@ -117,6 +124,28 @@ def next_state(graph: Graph, memory: Memory, state: str, q: str) -> str:
         graph.node("Add", entry(DISTANCE), driven),
         axis=1,
     )
+
+
+def _squeezed(graph: Graph, memory: Memory, obs: str, state: str) -> str:
+    """Return the observations with features squeezed (:meth:`rapid.networks.memory.Memory.squeezed`)."""
+
+    def entry(index: int) -> str:
+        return graph.reshape(graph.cut(state, index, index + 1, 1), -1, 1, 1)
+
+    def row(first: int, end: int, ahead: str, least: str | float, most: str | float, speed: str) -> str:
+        rows = graph.cut(obs, first, end, 1)
+        present, y = graph.cut(rows, 0, 1, 2), graph.cut(rows, Y, Y + 1, 2)
+        lane = graph.node("Round", graph.node("Mul", y, 1 / LANE_WIDTH))
+        middle = graph.node("Mul", graph.node("Min", graph.node("Max", lane, least), most), LANE_WIDTH)
+        return graph.node("Concat", present, ahead, middle, speed, graph.node("Mul", y, 0.0), axis=2)
+
+    place = graph.node("Add", entry(DISTANCE), memory.start_x)
+    ego = row(0, 1, place, entry(LEFTMOST), entry(RIGHTMOST), entry(SPEED))
+    others = graph.cut(obs, 1, graph.vehicles, 1)
+    seen = graph.number(graph.node("Greater", graph.cut(others, 0, 1, 2), 0.5))
+    speed = graph.node("Mul", seen, TRAFFIC_SPEED)
+    rest = row(1, graph.vehicles, graph.cut(others, X, X + 1, 2), 0.0, float(memory.lanes - 1), speed)
+    return graph.node("Concat", ego, rest, axis=1)
 
 
 def _affine(graph: Graph, rows: str, matrix: np.ndarray, bias: np.ndarray) -> str:

@@ -69,7 +69,8 @@ class Bounds:
         present_BV1 = seen.centre[..., :1] > encoding.absent_V1
         memory = self.network.memory
         if memory is not None:
-            return self._of_road(_believed(memory, seen, state_BS), present_BV1, _recalled(memory, seen, state_BS))
+            believed = _squeezed if memory.squeeze else _believed
+            return self._of_road(believed(memory, seen, state_BS), present_BV1, _recalled(memory, seen, state_BS))
         least_BAA = self._of_road(seen, present_BV1)
         if self.network.config.mirror:
             turned = seen.scaled(encoding.turned_F).plus(encoding.far_side_F)
@@ -147,6 +148,21 @@ def _believed(memory: Memory, seen: Form, state_BS: Tensor) -> Form:
             entry = entry.scaled(-1.0).plus(most_B11).relu().scaled(-1.0).plus(most_B11)
         rows.append(entry)
     return joined([joined(rows, -1), seen.map(lambda part: part[..., 1:, :])], -2)
+
+
+def _squeezed(memory: Memory, seen: Form, state_BS: Tensor) -> Form:
+    """Return what is seen with features squeezed.
+
+    Presence, and where along the road the others are, stay what they were. Every other entry rises with the one that it
+    is made of and depends on nothing else that is seen, so it lies between what the corners of the box give.
+    """
+    low_BVF, high_BVF = memory.squeezed(seen.low, state_BS), memory.squeezed(seen.high, state_BS)
+    # Speeds are told by presence alone, which is that of the middle.
+    low_BVF[..., 3] = high_BVF[..., 3] = memory.squeezed(seen.centre, state_BS)[..., 3]
+    kept_VF = torch.zeros_like(low_BVF[0], dtype=torch.bool)
+    kept_VF[:, 0] = kept_VF[1:, 1] = True
+    corners = between(low_BVF, high_BVF, len(seen.linear))
+    return Form(*(torch.where(kept_VF, old, new) for old, new in zip(seen, corners, strict=True)))
 
 
 def _recalled(memory: Memory, seen: Form, state_BS: Tensor) -> list[Form]:

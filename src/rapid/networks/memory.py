@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rapid.config_learning import NetworkConfig
+from rapid.road import LANE_WIDTH, START_SPEED
 from rapid.scenarios import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER, TARGET_SPEEDS
 
 STEPS, SPEED_INDEX, SPEED, LEFTMOST, RIGHTMOST, DISTANCE = range(6)
@@ -25,8 +26,8 @@ HIDDEN = 32
 """Width of the layer behind what is known."""
 EPISODE = 30
 """Decisions of an episode."""
-START_SPEED, START_INDEX = 25.0, 6
-"""m/s with which an episode begins, and the index of the nearest speed that can be kept to."""
+START_INDEX = 6
+"""Of the target speed nearest to that with which an episode begins."""
 KNOWN = EPISODE + len(TARGET_SPEEDS) + 6
 """M: what is known at a decision (:meth:`Memory.knowledge`)."""
 START_TOLERANCE = 5.5
@@ -40,6 +41,8 @@ LAG = (1 - 1 / 9) ** 15
 """Share of a difference in speed that is left after a decision: 15 frames, each of which takes off a ninth."""
 LAG_DISTANCE = (1 - LAG) / (15 / 9)
 """Metres driven more in a decision for each m/s above the speed kept to."""
+TRAFFIC_SPEED = 21.0
+"""m/s that every other car is taken to drive where features are squeezed."""
 
 
 def initial_state(count: int, lanes: int) -> NDArray[np.float32]:
@@ -94,7 +97,7 @@ class Memory(nn.Module):
 
     def __init__(self, config: NetworkConfig, lanes: int) -> None:
         super().__init__()
-        self.lanes = lanes
+        self.lanes, self.squeeze = lanes, config.squeeze
         policies = config.num_policies if config.kind == "rapid" else 1
         self.hidden = nn.Linear(KNOWN, HIDDEN)
         self.out = nn.Linear(HIDDEN, 2 * config.width + policies, bias=False)
@@ -107,7 +110,11 @@ class Memory(nn.Module):
 
         Its place along the road is that of its start and what it drove, its speed its own. What is true lies within, so
         that without an attack nothing changes; and an attack on this row hardly moves how near the others seem.
+
+        Where features are squeezed (:meth:`squeezed`) that goes for every row.
         """
+        if self.squeeze:
+            return self.squeezed(obs_BVF, state_BS)
         place_B, speed_B = self.start_x + state_BS[:, DISTANCE], state_BS[:, SPEED]
         late_B = place_B - START_TOLERANCE - DELAY * state_BS[:, STEPS]
         lowest_B4 = torch.stack([late_B, torch.full_like(late_B, -torch.inf), speed_B - SLANT, -speed_B - ROUNDING], 1)
@@ -116,14 +123,41 @@ class Memory(nn.Module):
         ego_B4 = torch.minimum(torch.maximum(obs_BVF[:, 0, 1:], lowest_B4), highest_B4)
         return torch.cat([torch.cat([obs_BVF[:, 0, :1], ego_B4], 1)[:, None], obs_BVF[:, 1:]], 1)
 
+    def squeezed(self, obs_BVF: Tensor, state_BS: Tensor) -> Tensor:
+        """Return the observations (B, V, F) with nothing in them that an attack within 0.1 could bend far.
+
+        "Feature squeezing" (Xu et al., 2018), with what is known of roads and cars. Of the ego, place and speed are its
+        own; its lane is one that it can be on. Of the others, place and presence are read as they are, y as the middle
+        of the nearest lane, and speeds as those of usual traffic. A car in the middle of its lane is read the same
+        unless y is moved by 2 m, and 0.1 are 1.2, 1.6 and 2 m on three, four and five lanes. So what an attack can do
+        is to move cars along the road.
+
+        Gradients pass where y is rounded, as if it were not: an attack that follows them is not misled (BPDA; Athalye
+        et al., 2018).
+        """
+        present_BV, x_BV, y_BV, *_ = obs_BVF.unbind(-1)
+        # The ego's row is the first, and is known to be within these lanes; the others are on one of the road's.
+        least_BV, most_BV = torch.zeros_like(y_BV), torch.full_like(y_BV, self.lanes - 1)
+        least_BV[:, 0], most_BV[:, 0] = state_BS[:, LEFTMOST], state_BS[:, RIGHTMOST]
+        lane_BV = torch.minimum(torch.maximum((y_BV / LANE_WIDTH).round(), least_BV), most_BV)
+        middle_BV = (lane_BV * LANE_WIDTH).detach() + (y_BV - y_BV.detach())
+        ahead_BV, speed_BV = x_BV.clone(), torch.where(present_BV > 0.5, TRAFFIC_SPEED, 0.0)
+        ahead_BV[:, 0], speed_BV[:, 0] = self.start_x + state_BS[:, DISTANCE], state_BS[:, SPEED]
+        return torch.stack([present_BV, ahead_BV, middle_BV, speed_BV, torch.zeros_like(x_BV)], -1)
+
     def knowledge(self, obs_BVF: Tensor, state_BS: Tensor) -> Tensor:
         """Return what is known (B, M), scaled to about +-1.
 
         That is the step and the speed kept to, each as one of so many, so that each can have a plan of its own; the
         speed had, the lanes possible and how many cars are present; none of which an attack that leaves presence alone
-        can move. And by how much the ego's seen speed and place differ from what is known.
+        can move. And by how much the ego's seen speed and place differ from what is known; 0 where features are
+        squeezed.
         """
         ego_BF = obs_BVF[:, 0]
+        faster_B = ego_BF[:, 3] - state_BS[:, SPEED]
+        farther_B = ego_BF[:, 1] - state_BS[:, DISTANCE] - self.start_x
+        if self.squeeze:
+            faster_B, farther_B = torch.zeros_like(faster_B), torch.zeros_like(farther_B)
         most = max(self.lanes - 1, 1)
         present_B = (obs_BVF[..., 0] > 0.5).sum(1) / obs_BVF.shape[1]
         numbers_BK = torch.stack(
@@ -132,8 +166,8 @@ class Memory(nn.Module):
                 state_BS[:, LEFTMOST] / most,
                 state_BS[:, RIGHTMOST] / most,
                 present_B,
-                (ego_BF[:, 3] - state_BS[:, SPEED]) / 4,
-                (ego_BF[:, 1] - state_BS[:, DISTANCE] - self.start_x) / 20,
+                faster_B / 4,
+                farther_B / 20,
             ],
             1,
         )

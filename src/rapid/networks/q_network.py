@@ -170,7 +170,7 @@ def build_network(config: NetworkConfig, lanes: int, seed: int) -> QNetwork:
         RapidError: N < 1, K outside 1..N, a width that the heads do not divide, vehicles outside 2..51, a memory that
             :func:`check_memory` refuses, or a shield that :func:`rapid.safety.read_box` does not read.
     """
-    if config.memory:
+    if config.memory or config.squeeze:
         check_memory(config)
     if config.shield:
         read_box(config.shield, lanes)
@@ -300,19 +300,23 @@ def set_phase(network: QNetwork, phase: Phase, freeze_decoder: bool = False) -> 
         head.decoder.requires_grad_(False)
 
 
-def with_memory(network: QNetwork) -> QNetwork:
+def with_memory(network: QNetwork, squeeze: bool = False) -> QNetwork:
     """Return the network as one that has a memory; it acts as it did, bit for bit, until it has learned to use it.
+
+    Args:
+        network: the network; what it has stays.
+        squeeze: read squeezed features from now on (:meth:`rapid.networks.memory.Memory.squeezed`), which changes what
+            it does at once.
 
     Raises:
         RapidError: what :func:`check_memory` refuses.
     """
-    config = replace(network.config, memory=True)
+    config = replace(network.config, memory=True, squeeze=squeeze or network.config.squeeze)
     check_memory(config)
-    if network.memory is not None:
+    if config == network.config:
         return network
     other = build_network(config, network.lanes, seed=0).to(network.scale_F.device)
-    memory = {name: value for name, value in other.state_dict().items() if name.startswith("memory.")}
-    other.load_state_dict(network.state_dict() | memory)
+    other.load_state_dict(other.state_dict() | network.state_dict())
     return other.train(network.training)
 
 
@@ -333,8 +337,12 @@ def check_memory(config: NetworkConfig) -> None:
     """Check that a network of these settings can have a memory.
 
     Raises:
-        RapidError: it has no tokens, or averages with the mirror image.
+        RapidError: it has no tokens, averages with the mirror image, or would squeeze features without a memory.
     """
+    if not config.memory:
+        raise RapidError(
+            "Squeezed features take the ego's place and speed from a memory. Set memory as well, or unset squeeze."
+        )
     if config.kind not in ("rapid", "attentive"):
         raise RapidError(
             f"A network of kind '{config.kind}' has no tokens that a memory could speak to. Unset memory, or choose "

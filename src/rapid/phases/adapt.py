@@ -61,7 +61,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
     dataset = load_dataset(data) if data else None
     offline = learnable(dataset) if dataset else None
     if settings.memory or network.memory is not None:
-        check_memory(replace(network.config, mirror=network.config.mirror or settings.mirror))
+        check_memory(replace(network.config, memory=True, mirror=network.config.mirror or settings.mirror))
     # Of what was distilled, before it is mirrored or sees farther.
     forgetting = Forgetting(network, offline, seed)
     if settings.vehicles:
@@ -101,7 +101,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
             )
         if settings.ppo.steps:
             if settings.memory:
-                network = for_lanes(with_memory(network), lanes)
+                network = for_lanes(with_memory(network, settings.squeeze), lanes)
             timed = replace(get_scenario(scenario), clock=True)
             # As many processes step the worlds as the learner may use threads.
             processes = config.threads if config.simulator == "compiled" else 1
