@@ -32,6 +32,7 @@ import numpy as np
 import torch
 
 from rapid.agents.saved import QAgent
+from rapid.baselines import offline_baseline
 from rapid.config import DistillConfig, NetworkConfig
 from rapid.data.batch import TransitionBatch
 from rapid.data.dataset import Dataset, load_dataset, save_dataset
@@ -45,7 +46,7 @@ from rapid.losses import q_loss
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.networks.stack import stack_networks
 from rapid.phases.data import collect_transitions
-from rapid.presets import offline_baseline, preset
+from rapid.presets import preset
 from rapid.progress import task
 from rapid.runs import commit as source_commit
 from rapid.scenarios import get_scenario

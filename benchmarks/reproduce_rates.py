@@ -19,7 +19,7 @@ from rapid.experiments.compute import work_of
 from rapid.experiments.costs import rates
 from rapid.experiments.costs import sizes as sizes_on_disk
 from rapid.experiments.exhibits import ALL, cells_of
-from rapid.experiments.methods import EFFORTS
+from rapid.experiments.learned import EFFORTS
 from rapid.experiments.store import Store
 from rapid.files import write_text
 

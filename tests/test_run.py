@@ -20,6 +20,7 @@ import torch
 
 import rapid
 from rapid.agents.saved import QAgent
+from rapid.baselines import offline_baseline, online_baseline
 from rapid.config import Config, PpoConfig
 from rapid.config_io import apply_overrides, validate
 from rapid.data.batch import TransitionBatch
@@ -36,7 +37,7 @@ from rapid.phases.data import data_folders, mix_datasets
 from rapid.phases.distill import distill_agent, distill_seeds
 from rapid.phases.measure import compare
 from rapid.phases.page import report_again
-from rapid.presets import offline_baseline, online_baseline, preset
+from rapid.presets import preset
 from rapid.run import run
 from rapid.runs import STEPS
 from rapid.scenarios import SLOWER

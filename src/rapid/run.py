@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rapid.agents.open import open_agent
+from rapid.baselines import offline_baseline, online_baseline
 from rapid.config import Config
 from rapid.data.dataset import Dataset
 from rapid.data.fallbacks import fallback_notice
@@ -22,7 +23,6 @@ from rapid.phases.data import collect_transitions, data_folders, given_data, mix
 from rapid.phases.distill import distill_agent
 from rapid.phases.measure import FLOORS, PLANNER, TEACHER, floors_under_attack, measure, why_no_teacher
 from rapid.phases.page import write_run_report
-from rapid.presets import offline_baseline, online_baseline
 from rapid.progress import format_seconds
 from rapid.runs import MANIFEST, STEPS, RunDirectory, commit
 from rapid.scenarios import get_scenario

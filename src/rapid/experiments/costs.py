@@ -7,7 +7,7 @@ from importlib import resources
 from rapid.config import TeacherConfig
 from rapid.experiments.cells import Cell, Collect, inputs, key
 from rapid.experiments.compute import work_of
-from rapid.experiments.methods import Setting, mixture, rapid
+from rapid.experiments.learned import Setting, mixture, rapid
 from rapid.experiments.tables import Facts, markdown
 from rapid.scenarios import PAPER_SCENARIOS
 

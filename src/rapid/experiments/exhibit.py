@@ -6,11 +6,12 @@ from typing import Literal
 
 from rapid.attacks.spec import NAMED
 from rapid.evaluation.metrics import EpisodeRow
-from rapid.experiments import methods as make
+from rapid.experiments import learned as make
 from rapid.experiments import words
 from rapid.experiments.cells import Adapt, Cell, Distill, Drive, Driver
 from rapid.experiments.figures import Lines, Router
-from rapid.experiments.methods import METHODS, Method, Setting
+from rapid.experiments.learned import Setting
+from rapid.experiments.methods import METHODS, Method
 from rapid.experiments.migrate import Legacy
 from rapid.experiments.paper import paper_result
 from rapid.experiments.store import Store

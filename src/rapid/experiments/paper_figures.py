@@ -3,11 +3,12 @@
 from typing import Literal
 
 from rapid.config import MixConfig, TeacherConfig
-from rapid.experiments import methods as make
+from rapid.experiments import learned as make
 from rapid.experiments.cells import Adapt, Cell, Collect, Distill, Drive, Driver, Mix, Scenes
 from rapid.experiments.exhibit import Exhibit, Request, Shown, driven, drives, method_drives, rows_of
 from rapid.experiments.figures import Curve, Lines, Router
-from rapid.experiments.methods import METHODS, OFFLINE_ITERATIONS, Reading, mixture
+from rapid.experiments.learned import OFFLINE_ITERATIONS, Reading, mixture
+from rapid.experiments.methods import METHODS
 from rapid.experiments.store import Store
 from rapid.experiments.tables import entry
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 
-from rapid.experiments import methods as make
+from rapid.experiments import learned as make
 from rapid.experiments import words
 from rapid.experiments.cells import Adapt, Cell, Decide, Distill, Drive, Mix
 from rapid.experiments.exhibit import ATTACKS, Exhibit, Request, Shown, applicable, comparison, drives, rows_of
-from rapid.experiments.methods import METHODS, Dataset, Reading, Setting, mixture
+from rapid.experiments.learned import Dataset, Reading, Setting, mixture
+from rapid.experiments.methods import METHODS
 from rapid.experiments.paper import paper_result
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Entry, Facts, Table, entry

@@ -17,7 +17,7 @@ from rapid.experiments.exhibit import Exhibit, Request, Shown
 from rapid.experiments.exhibits import ALL, cells_of, recipe_of
 from rapid.experiments.figures import Lines, Router, save
 from rapid.experiments.graph import Outcome, plan, run
-from rapid.experiments.methods import EFFORTS
+from rapid.experiments.learned import EFFORTS
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Facts, Table
 from rapid.files import write_text

@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rapid.attacks.spec import parse_attack
+from rapid.baselines import offline_baseline
 from rapid.experiments.paper import paper_numbers
 from rapid.experiments.tables import Facts
-from rapid.presets import offline_baseline, preset
+from rapid.presets import preset
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
 DATASETS = {"random": "random (D_rand)", "llm": "teacher (D_LLM)", "mixed": "mixed (D*)"}

@@ -6,6 +6,7 @@ from pathlib import Path
 from rapid.agents.open import check_road
 from rapid.agents.q_agent import QAgent
 from rapid.agents.saved import load_agent, save_agent
+from rapid.baselines import OnlineBaseline
 from rapid.config import Config, without_place
 from rapid.config_io import parts_of, to_dict
 from rapid.config_learning import NetworkConfig
@@ -15,7 +16,6 @@ from rapid.networks.q_network import build_network, check_memory, for_lanes, wid
 from rapid.phases.checks import shown_plan
 from rapid.phases.data import learnable
 from rapid.phases.measure import learning_curve
-from rapid.presets import OnlineBaseline
 from rapid.progress import task
 from rapid.scenarios import get_scenario, seeing
 from rapid.seeding import stream_seed

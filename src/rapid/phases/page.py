@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rapid.agents.saved import load_agent, remembered
+from rapid.baselines import online_baseline
 from rapid.config import Config
 from rapid.config_io import apply_overrides, to_dict
 from rapid.data.dataset import load_dataset, summary
@@ -16,7 +17,7 @@ from rapid.files import read_json
 from rapid.phases.adapt import ONLINE, PPO
 from rapid.phases.data import data_folders
 from rapid.phases.measure import recorded
-from rapid.presets import as_options, of_file, online_baseline, without_presets
+from rapid.presets import as_options, of_file, without_presets
 from rapid.report import ReportData, RoutingSnapshot, write_figures, write_report
 from rapid.runs import STEPS
 from rapid.training.machinery.record import load_metrics
