@@ -60,12 +60,14 @@ def online_baseline(config: Config, algorithm: OnlineBaseline) -> Config:
         rate = paper_numbers()["hyperparameters"]["dqn"]["learning_rate"]
     steps, ppo = adapt.steps + adapt.ppo.steps, adapt.ppo
     # An MLP has weights for every row and no tokens: it sees from the start as far as RAPID in the end, and no memory.
-    network = replace(config.network, kind="mlp", memory=False, vehicles=adapt.vehicles or config.network.vehicles)
+    rows = adapt.vehicles or config.network.vehicles
+    network = replace(config.network, kind="mlp", memory=False, squeeze=False, vehicles=rows)
     adapt = replace(
         adapt,
         train="scratch",
         vehicles=0,
         memory=False,
+        squeeze=False,
         exploration_start=1.0,
         exploration_end=0.05,
         offline_share=0.0,

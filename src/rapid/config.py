@@ -34,7 +34,7 @@ from rapid.config_learning import RobustConfig as RobustConfig
 
 Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full"]
-Plan = Literal["printed", "careful", "bold", "ppo", "robust", "guided"]
+Plan = Literal["printed", "careful", "bold", "ppo", "robust", "guided", "squeezed"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
 PLANS: tuple[str, ...] = typing.get_args(Plan)
@@ -174,7 +174,8 @@ class Config:
     """How much is run."""
     plan: Plan = "bold"
     """How phase 3 learns: `printed` as the paper does; `careful` close to the data; `bold` by much exploring; `ppo` so
-    for longer, and then by PPO; `robust` by PPO under attack, with a memory."""
+    for longer, and then by PPO; `robust` by PPO under attack, with a memory; `guided` as `ppo`, and is then shown under
+    attack what to do; `squeezed` as `ppo`, later under attack, by features that an attack cannot bend far."""
     scenario: str = "lane-3-density-2"
     """Where the data is collected and policies are trained and measured."""
     simulator: Literal["compiled", "highway-env"] = "compiled"

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from rapid.agents.shipped import shipped_agents
 from rapid.baselines import OnlineBaseline, offline_baseline, online_baseline
-from rapid.config import Config, MixConfig, TeacherConfig
+from rapid.config import AdaptConfig, Config, MixConfig, TeacherConfig
 from rapid.experiments.cells import Adapt, Data, Distill, Driver, Fresh, Mix, Relabel, Shipped
 from rapid.presets import preset
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
@@ -162,20 +162,35 @@ def robust(setting: Setting) -> Adapt:
 
 GUIDED_STEPS = 153_600
 """Environment steps in which a trained agent is shown what to do under attack: 40 rollouts."""
+SQUEEZED_STEPS = 1_200_000
+"""Environment steps in which a trained agent learns by squeezed features, three quarters of them under attack."""
 
 
 def guided(setting: Setting) -> Adapt:
-    """Return RAPID that is shown under attack what to do, after its phase 3 by the plan `ppo`.
-
-    It goes on from the agent of that plan that is shipped for the scenario, where one is: all seeds from the same.
-    """
+    """Return RAPID that is shown under attack what to do, after its phase 3 by the plan `ppo`."""
     settings = setting.config(plan="guided").adapt
-    steps = GUIDED_STEPS if setting.effort.steps is None else settings.ppo.steps // 2
+    settings = replace(settings, adversary=replace(settings.adversary, begin=0.0, guided=1.0))
+    return _from_trained(setting, settings, GUIDED_STEPS, critic_steps=0)
+
+
+def squeezed(setting: Setting) -> Adapt:
+    """Return RAPID that learns under attack by squeezed features, after its phase 3 by the plan `ppo`."""
+    settings = setting.config(plan="squeezed").adapt
+    settings = replace(settings, adversary=replace(settings.adversary, begin=0.25))
+    return _from_trained(setting, settings, SQUEEZED_STEPS, settings.ppo.critic_steps)
+
+
+def _from_trained(setting: Setting, settings: AdaptConfig, steps: int, critic_steps: int) -> Adapt:
+    """Return what goes on by PPO from the agent of the plan `ppo`.
+
+    Where such an agent is shipped for the scenario it is that one, for all seeds the same.
+    """
+    if setting.effort.steps is not None:
+        steps = settings.ppo.steps // 2
     settings = replace(
         settings,
         steps=0,
-        ppo=replace(settings.ppo, steps=steps, critic_steps=0, attention="compiled"),
-        adversary=replace(settings.adversary, begin=0.0, guided=1.0),
+        ppo=replace(settings.ppo, steps=steps, critic_steps=critic_steps, attention="compiled"),
         evaluate_every=max(1, steps // CURVE_POINTS),
     )
     shipped_one = f"{setting.scenario}/rapid"

@@ -18,6 +18,7 @@ from rapid.experiments.learned import (
     paper_data,
     rapid,
     robust,
+    squeezed,
     the_teacher,
     without,
 )
@@ -106,6 +107,7 @@ METHODS: dict[str, Method] = {
             robust,
         ),
         Method("rapid-guided", "RAPID, guided under attack", "learned", guided),
+        Method("rapid-squeezed", "RAPID, squeezed features, under attack", "learned", squeezed),
         Method("mlp-ppo", "MLP, 300K + 700K PPO", "learned", mlp_by_ppo),
         Method("online-ddqn-10k", "online DDQN, 10K", "learned", lambda s: from_scratch(s, "ddqn", "careful")),
         Method(
