@@ -289,6 +289,32 @@ def test_the_plan_robust_adapts_an_agent_on_disk(tmp_path):
         adapt_agent(mirrored, tmp_path / "out" / "agent", None, tmp_path / "mirrored")
 
 
+def test_the_plan_squeezed_reads_squeezed_features_from_ppo_on_and_leaves_policy_1_as_it_was(tmp_path):
+    usual = preset("strong", "tiny", "squeezed")
+    small = replace(usual.adapt.ppo, steps=960, critic_steps=240, num_envs=8, batch_size=60)
+    config = replace(usual, adapt=replace(usual.adapt, steps=0, ppo=small, evaluate_every=0))
+    validate(config)
+    distilled = network()
+    save_agent(tmp_path / "distilled", distilled, {"scenario": SCENARIO})
+    agent = adapt_agent(config, tmp_path / "distilled", None, tmp_path / "out")
+    loaded = load_agent(tmp_path / "out" / "agent")
+    assert loaded.network.config.squeeze
+    assert weights(loaded.network) == weights(agent.network)
+    first, before = loaded.network.head.mixture.policies[0], distilled.head.mixture.policies[0]
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), before.parameters(), strict=True))
+    # Who goes on without the setting still reads as it learned to.
+    plain = replace(usual.adapt, memory=False, squeeze=False, steps=0, ppo=small, evaluate_every=0)
+    on = adapt_agent(replace(usual, adapt=plain), tmp_path / "out" / "agent", None, tmp_path / "on")
+    assert on.network.config.squeeze
+
+    def refused(message, **changes):
+        with pytest.raises(RapidError, match=message):
+            validate(replace(usual, **changes))
+
+    refused("adapt.squeeze' is True, but must be false where", adapt=replace(usual.adapt, memory=False))
+    refused("network.squeeze' is True, but must be false", network=replace(usual.network, squeeze=True))
+
+
 def test_as_many_processes_step_the_worlds_as_threads_are_allowed_and_no_weight_differs(tmp_path, monkeypatch):
     usual = preset("strong", "tiny", "robust")
     small = replace(usual.adapt.ppo, steps=480, critic_steps=240, num_envs=8, batch_size=60)

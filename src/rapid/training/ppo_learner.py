@@ -243,4 +243,5 @@ def without_clock(obs_BVF: Tensor) -> Tensor:
 
 def _critic(config: NetworkConfig) -> NetworkConfig:
     """Return the settings of the critic's network: a single policy of the same size, or an MLP."""
-    return replace(config, kind="mlp" if config.kind.startswith("mlp") else "attentive", memory=False)
+    kind = "mlp" if config.kind.startswith("mlp") else "attentive"
+    return replace(config, kind=kind, memory=False, squeeze=False)
