@@ -69,12 +69,11 @@ def _simulator() -> Finding:
     import numpy as np
 
     import rapid
-    from rapid.simulator.compile import damaged_cache_files
-    from rapid.simulator.step import step_worlds
+    from rapid.networks import layer_kernels  # noqa: F401  # these have kernels of their own, beside the simulator's
+    from rapid.simulator.compile import cache_folders, damaged_cache_files
+    from rapid.teacher import foresight  # noqa: F401
 
-    cache = getattr(step_worlds, "_cache", None)  # none where no directory can be written
-    folder = getattr(cache, "cache_path", None)
-    damaged = damaged_cache_files(folder) if folder else []
+    damaged = [path for folder in cache_folders() for path in damaged_cache_files(folder)]
     start = time.perf_counter()
     env = rapid.make_vec("lane-3-density-2", 64, seed=0)
     env.reset(seed=0)
@@ -88,7 +87,8 @@ def _simulator() -> Finding:
     speed = steps / (time.perf_counter() - start)
     fact = f"{speed:,.0f} decisions/s at 64 worlds, first step after {first:.1f} s"
     if damaged:
-        fact += f"; {len(damaged)} damaged file{'s' * (len(damaged) > 1)} of machine code in {folder}"
+        folders = " and ".join(sorted({str(path.parent) for path in damaged}))
+        fact += f"; {len(damaged)} damaged file{'s' * (len(damaged) > 1)} of machine code in {folders}"
         fix = "Each is compiled anew as soon as it is needed. If it happens again, look at the disk."
         return Finding("simulator", "warning", fact, fix)
     if speed < 500:

@@ -87,7 +87,7 @@ def test_a_damaged_cache_is_noticed_told_and_compiled_anew(
     assert _load(tmp_path)(21) == 42
     (stored,) = (tmp_path / "cache").rglob(file)
     damage(stored)
-    assert compiling.damaged_cache_files(stored.parent) == [stored.name]
+    assert compiling.damaged_cache_files(stored.parent) == [stored]
     capsys.readouterr()
     assert _load(tmp_path)(21) == 42
     told = capsys.readouterr().err
@@ -116,14 +116,15 @@ def test_a_full_disk_does_not_stop_a_kernel(
 
 def test_doctor_names_damaged_machine_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from rapid import doctor
-    from rapid.simulator import step
 
     monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
     double = _load(tmp_path)
     assert double(21) == 42
     (stored,) = (tmp_path / "cache").rglob("*.nbc")
-    monkeypatch.setattr(step.step_worlds._cache, "_cache_path", str(stored.parent))  # type: ignore[attr-defined]
+    assert stored.parent in compiling.cache_folders()
     assert "damaged" not in doctor._simulator().fact
+    # The simulator's kernels, and those of networks and teachers.
+    assert len({folder for folder in compiling.cache_folders() if folder != stored.parent}) >= 3
     _zeros(stored)
     found = doctor._simulator()
     assert found.verdict == "warning"

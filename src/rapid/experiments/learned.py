@@ -183,7 +183,7 @@ def squeezed(setting: Setting) -> Adapt:
 def _from_trained(setting: Setting, settings: AdaptConfig, steps: int, critic_steps: int) -> Adapt:
     """Return what goes on by PPO from the agent of the plan `ppo`.
 
-    Where such an agent is shipped for the scenario it is that one, for all seeds the same.
+    It is the same for all seeds: the one that is shipped for the scenario, or the training with seed 0.
     """
     if setting.effort.steps is not None:
         steps = settings.ppo.steps // 2
@@ -197,7 +197,8 @@ def _from_trained(setting: Setting, settings: AdaptConfig, steps: int, critic_st
     if shipped_one in shipped_agents():
         origin = Driver(f"shipped:{shipped_one}")
     else:
-        origin = rapid(setting, paper_data(setting), plan="ppo")
+        first = replace(setting, seed=0)
+        origin = rapid(first, paper_data(first), plan="ppo")
     return Adapt(origin, None, setting.scenario, settings, setting.seed, setting.effort.curve_spawns)
 
 

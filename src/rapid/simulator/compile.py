@@ -34,6 +34,7 @@ _DIGEST = hashlib.sha256().digest_size
 _MARK = "-checked"
 """In the name of every file of the cache that ends with its digest; numba's own files have none."""
 _troubles: list[str] = []
+_folders: set[str] = set()
 
 
 class _CheckedCacheFile(IndexDataCacheFile):
@@ -90,7 +91,7 @@ class _CheckedCacheFile(IndexDataCacheFile):
         except (OSError, _DamagedError) as error:
             if not _troubles:
                 print(
-                    f"rapid: machine code of the simulator in '{self._cache_path}' cannot be used ({error}). What "
+                    f"rapid: machine code in '{self._cache_path}' cannot be used ({error}). What "
                     "is needed of it is compiled anew, which takes up to half a minute.",
                     file=sys.stderr,
                     flush=True,
@@ -116,17 +117,22 @@ def _checked_content(path: Path) -> bytes | None:
     return content[:-_DIGEST]
 
 
-def damaged_cache_files(folder: str | Path) -> list[str]:
-    """Return the names of the cached kernels in a folder that are damaged or cannot be read.
+def cache_folders() -> list[Path]:
+    """Return where the kernels that were defined so far keep their machine code."""
+    return sorted(map(Path, _folders))
+
+
+def damaged_cache_files(folder: str | Path) -> list[Path]:
+    """Return the cached kernels in a folder that are damaged or cannot be read.
 
     Each is compiled anew as soon as it is needed.
     """
-    damaged: list[str] = []
+    damaged: list[Path] = []
     for path in sorted(Path(folder).glob(f"*{_MARK}.*nb[ci]")):
         try:
             _checked_content(path)
         except _DamagedError:
-            damaged.append(path.name)
+            damaged.append(path)
     return damaged
 
 
@@ -148,6 +154,7 @@ def kernel(function: Function) -> Function:
     stored: Any = getattr(dispatcher, "_cache", None)
     if isinstance(getattr(stored, "_cache_file", None), IndexDataCacheFile):
         stored._cache_file = _CheckedCacheFile(stored._cache_file)
+        _folders.add(str(stored.cache_path))
     return cast(Function, dispatcher)
 
 
