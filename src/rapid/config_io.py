@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar
 
 from rapid.bounds import check_bounds
 from rapid.config import Config
-from rapid.config_learning import NetworkConfig, PpoConfig
+from rapid.config_learning import AdaptConfig, NetworkConfig
 from rapid.errors import RapidError, did_you_mean
 from rapid.safety import read_box
 from rapid.scenarios import NUM_ACTIONS, get_scenario
@@ -138,8 +138,8 @@ def validate(config: Config) -> Config:
         ("adapt.steps", adapt.steps > 0 or adapt.train != "scratch", "above 0 where adapt.train is 'scratch'"),
         (
             "adapt.ppo.steps",
-            adapt.ppo.steps == 0 or adapt.ppo.steps >= least_steps(adapt.ppo),
-            f"0 or at least {least_steps(adapt.ppo)}: until the policy learns, adapt.ppo.critic_steps = "
+            adapt.ppo.steps == 0 or adapt.ppo.steps >= least_steps(adapt),
+            f"0 or at least {least_steps(adapt)}: until the policy learns, adapt.ppo.critic_steps = "
             f"{adapt.ppo.critic_steps} in whole rollouts of adapt.ppo.num_envs * adapt.ppo.rollout = "
             f"{adapt.ppo.num_envs * adapt.ppo.rollout}, and one more",
         ),
@@ -233,10 +233,15 @@ def weights_about(network: NetworkConfig) -> int:
     return policies * sum(before * after for before, after in pairwise(sizes))
 
 
-def least_steps(ppo: PpoConfig) -> int:
-    """Return the fewest steps of PPO in which the policy learns anything."""
+def least_steps(adapt: AdaptConfig) -> int:
+    """Return the fewest steps of PPO in which the policy learns anything: one rollout after those of the critic alone.
+
+    From a guide that shows what to do from the beginning it learns at once.
+    """
+    ppo, guide = adapt.ppo, adapt.adversary
     per_rollout = max(ppo.num_envs * ppo.rollout, 1)
-    return (-(-ppo.critic_steps // per_rollout) + 1) * per_rollout
+    alone = 0 if guide.guided and not guide.begin else -(-ppo.critic_steps // per_rollout)
+    return (alone + 1) * per_rollout
 
 
 def value(config: Any, name: str) -> Any:

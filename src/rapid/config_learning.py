@@ -215,7 +215,8 @@ class PpoConfig:
     """The critic's gradients are clipped to this norm."""
     attention: Literal["torch", "compiled"] = "torch"
     """Who computes the layers of transformers of up to 16 tokens while learning, attention and all: torch, or on a CPU
-    RAPID's own compiled code, which is faster at it and rounds otherwise."""
+    RAPID's own compiled code, which is faster at it and rounds otherwise. Layers whose width or feed-forward width is
+    no multiple of 16 are torch's in either case."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """``rapid doctor``: look at everything a run needs and say what to do about each failure."""
 
+import importlib
 import importlib.util
 import os
 import platform
@@ -69,10 +70,11 @@ def _simulator() -> Finding:
     import numpy as np
 
     import rapid
-    from rapid.networks import layer_kernels  # noqa: F401  # these have kernels of their own, beside the simulator's
     from rapid.simulator.compile import cache_folders, damaged_cache_files
-    from rapid.teacher import foresight  # noqa: F401
 
+    # Beside the simulator's, which others import, these have kernels of their own.
+    for module in ("rapid.networks.layer_kernels", "rapid.teacher.foresight"):
+        importlib.import_module(module)
     damaged = [path for folder in cache_folders() for path in damaged_cache_files(folder)]
     start = time.perf_counter()
     env = rapid.make_vec("lane-3-density-2", 64, seed=0)

@@ -14,7 +14,7 @@ from rapid.experiments.figures import Curve, Lines, Point, Router, save
 from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
 from rapid.experiments.paper import PaperResult
-from rapid.experiments.reproduce import open_reproduction, verdicts, write_page
+from rapid.experiments.reproduce import listing, open_reproduction, verdicts, write_page
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Entry, Facts, Table, entry
 
@@ -126,6 +126,11 @@ def test_an_unknown_label_in_the_committed_rows_is_an_error(monkeypatch: pytest.
 def test_a_page_of_nothing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     of = open_reproduction(("attack", "environment", "ratio"), "paper", "tiny", tmp_path / "store")
+    # Whoever asks elsewhere than in a checkout is told why nothing is done.
+    assert listing(of).startswith("There are no committed results in")
+    (tmp_path / "results" / "cells").mkdir(parents=True)
+    beside = open_reproduction(("attack",), "paper", "tiny", tmp_path / "store")
+    assert listing(beside).startswith("id")
     page = write_page(of, tmp_path / "page").read_text()
     assert "parts are missing" in page
     assert "KinematicsObservation" in page

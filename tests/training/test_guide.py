@@ -14,7 +14,7 @@ from test_ppo import PPO, worlds
 
 from rapid.agents.saved import save_agent
 from rapid.config import AdaptConfig, Config, NetworkConfig
-from rapid.config_io import validate
+from rapid.config_io import least_steps, validate
 from rapid.errors import RapidError
 from rapid.networks.memory import STEPS, initial_state
 from rapid.networks.q_network import QNetwork, build_network, with_memory
@@ -200,6 +200,13 @@ def test_bad_guides_are_refused(tmp_path: Path):
     # Before any work of a run, which would collect and distil first.
     with pytest.raises(RapidError, match="A plan is written 5,2,4"):
         check(replace(usual, adapt=guided))
+    # A guide teaches from the first rollout on; the critic's steps alone do not come before it.
+    rollout = long.ppo.num_envs * long.ppo.rollout
+    at_once = replace(GUIDED.adversary, begin=0.0, guided=1.0)
+    short = replace(long, memory=True, ppo=replace(long.ppo, steps=rollout), adversary=at_once)
+    later = replace(long, adversary=replace(at_once, begin=0.5, guided=0.5))
+    assert least_steps(short) == rollout < short.ppo.critic_steps < least_steps(later)
+    validate(replace(usual, adapt=short))
     unattacked = replace(long, memory=True, adversary=replace(GUIDED.adversary, gradient_share=0.0, noise_share=0.0))
     with pytest.raises(RapidError, match="a plan is shown in attacked episodes"):
         validate(replace(usual, adapt=unattacked))

@@ -85,6 +85,16 @@ def open_reproduction(
     return Reproduction(exhibits, recipe, scale, Store(store, found, RESULTS if RESULTS.is_dir() else None))
 
 
+def without_layers(of: Reproduction) -> str:
+    """Return what to say where no committed results are read; otherwise nothing."""
+    if of.store.layers:
+        return ""
+    return (
+        f"There are no committed results in '{RESULTS / 'cells'}' here, so none of them counts as done. They lie in "
+        "RAPID's checkout: start this there to use them.\n"
+    )
+
+
 def listing(of: Reproduction) -> str:
     """Return every exhibit with what is done, predicted time and decisions of language models."""
     lines = [["id", "recipe", "done", "to do", "predicted", "LLM decisions", "what it is"]]
@@ -98,9 +108,8 @@ def listing(of: Reproduction) -> str:
         )
     whole = plan(of.cells(), of.store)
     total = f"Together, shared parts once: {len(whole.todo)} to do, {format_seconds(whole.seconds)} for one process"
-    return (
-        f"{aligned(lines)}\n\n{total}, as predicted, {whole.decisions} decisions of language models; scale {of.scale}."
-    )
+    asked = f"{whole.decisions} decisions of language models; scale {of.scale}."
+    return f"{without_layers(of)}{aligned(lines)}\n\n{total}, as predicted, {asked}"
 
 
 def reproduce(
@@ -118,6 +127,7 @@ def reproduce(
     check_engine(engine)
     due = plan(of.cells(), of.store)
     say(
+        f"{without_layers(of)}"
         f"{len(due.todo)} parts to compute, {due.done} done before; predicted {format_seconds(due.seconds / workers)}"
         f"{f' and {due.unknown} parts of unknown time' if due.unknown else ''}, {due.decisions} LLM decisions."
     )

@@ -73,9 +73,9 @@ def adapt_by_ppo(
     ppo, seen = config.ppo, get_scenario(scenario)
     if seen.reward == "progress":
         ppo = replace(ppo, crash_penalty=ppo.progress_crash_penalty)
-    if ppo.steps < least_steps(ppo):
+    if ppo.steps < least_steps(config):
         raise RapidError(
-            f"adapt.ppo.steps is {ppo.steps}, but the policy learns nothing in less than {least_steps(ppo)}: "
+            f"adapt.ppo.steps is {ppo.steps}, but the policy learns nothing in less than {least_steps(config)}: "
             f"adapt.ppo.critic_steps = {ppo.critic_steps} in whole rollouts, and one more. Raise it."
         )
     if config.adversary.guided and (network.memory is None or not plan):
