@@ -126,6 +126,31 @@ def test_what_is_shown_is_learned_and_the_critic_and_the_first_policy_left_alone
     assert shown_T == [*PLAN, IDLE]
 
 
+def test_who_begins_to_squeeze_features_is_shown_what_it_did_by_all_of_them(tmp_path: Path, monkeypatch: Any):
+    shown: list[QNetwork] = []
+
+    class Watched(Guide):
+        def __init__(self, network: QNetwork, *given: Any) -> None:
+            super().__init__(network, *given)
+            shown.append(self.network)
+
+    monkeypatch.setattr("rapid.training.ppo.Guide", Watched)
+    usual = preset("strong", "tiny", "squeezed")
+    small = replace(usual.adapt.ppo, steps=480, critic_steps=0, num_envs=8, batch_size=60, attention="torch")
+    first = replace(usual.adapt.adversary, begin=0.0, ramp=0.0, guided=1.0)
+    config = replace(usual, adapt=replace(usual.adapt, steps=0, ppo=small, adversary=first, evaluate_every=0))
+    distilled = network()
+    save_agent(tmp_path / "agent", distilled, {"scenario": SCENARIO})
+    agent = adapt_agent(config, tmp_path / "agent", None, tmp_path / "out")
+    (teacher,) = shown
+    assert (teacher.config.squeeze, agent.network.config.squeeze) == (False, True)
+    kept = teacher.state_dict()
+    assert all(torch.equal(kept[name], value) for name, value in distilled.state_dict().items())
+    # Who squeezed already goes on from what it did itself.
+    adapt_agent(config, tmp_path / "out" / "agent", None, tmp_path / "on")
+    assert shown[1].config.squeeze
+
+
 def test_after_the_guide_comes_the_return(tmp_path: Path):
     train(tmp_path, GUIDED, plan=PLAN)
     rows = lines(tmp_path)
@@ -133,10 +158,10 @@ def test_after_the_guide_comes_the_return(tmp_path: Path):
     assert ["value" in row for row in rows] == [False, False, True, True]
 
 
-@pytest.mark.parametrize("attention", ["torch", "compiled"])
+@pytest.mark.parametrize(("attention", "squeeze"), [("torch", False), ("compiled", False), ("compiled", True)])
 @pytest.mark.parametrize("stop", [1, 2, 3])
 def test_a_guided_training_that_was_killed_ends_as_one_that_was_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, attention: Literal["torch", "compiled"]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, attention: Literal["torch", "compiled"], squeeze: bool
 ):
     # The second and the third of four rollouts are guided; the checkpoint before the third holds a guide.
     config = replace(GUIDED, adversary=replace(MIXTURE, begin=0.25, guided=0.5))
@@ -144,8 +169,9 @@ def test_a_guided_training_that_was_killed_ends_as_one_that_was_not(
 
     def train(directory: Path, config: AdaptConfig, **options: Any) -> QNetwork:
         # As wide as what is compiled is made for.
-        net = with_memory(build_network(NetworkConfig(width=32, feedforward=32, vehicles=4), 3, 0))
-        return adapt_by_ppo(net, config, SCENARIO, directory, 3, make_worlds=worlds, **options)
+        seeing = with_memory(build_network(NetworkConfig(width=32, feedforward=32, vehicles=4), 3, 0))
+        origin, net = (seeing, with_memory(seeing, squeeze=True)) if squeeze else (None, seeing)
+        return adapt_by_ppo(net, config, SCENARIO, directory, 3, make_worlds=worlds, origin=origin, **options)
 
     whole = train(tmp_path / "whole", config, plan=PLAN)
     count, update = itertools.count(), PpoLearner.update

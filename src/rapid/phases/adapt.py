@@ -100,8 +100,12 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 forgetting=forgetting,
             )
         if settings.ppo.steps:
+            origin = None
             if settings.memory:
-                network = for_lanes(with_memory(network, settings.squeeze), lanes)
+                seeing_all = for_lanes(with_memory(network), lanes)
+                network = with_memory(seeing_all, settings.squeeze)
+                # What it did before it read squeezed features, by features as they are.
+                origin = None if network is seeing_all else seeing_all
             timed = replace(get_scenario(scenario), clock=True)
             # As many processes step the worlds as the learner may use threads.
             processes = config.threads if config.simulator == "compiled" else 1
@@ -117,6 +121,7 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 make_worlds=lambda count: make_vec(timed, count, config.simulator, config=seen, processes=processes),
                 track=tracker.log,
                 plan=plan,
+                origin=origin,
             )
     metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
     # What was used, which need not be what was asked for.

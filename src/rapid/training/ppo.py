@@ -47,6 +47,7 @@ def adapt_by_ppo(
     checkpoint_seconds: float = 60.0,
     track: Track | None = None,
     plan: Sequence[int] = (),
+    origin: QNetwork | None = None,
 ) -> QNetwork:
     """Train `network` in place for `config.ppo.steps` and return it; the same call goes on from the last checkpoint.
 
@@ -63,6 +64,7 @@ def adapt_by_ppo(
         checkpoint_seconds: time between two checkpoints.
         track: is given every row of metrics; their steps go on from `config.steps`.
         plan: the actions of an episode that a guide shows under attack (`config.adversary.guided`).
+        origin: the policy that it shows where nobody attacks; None is the network as it is when the guide begins.
 
     Raises:
         RapidError: a guide for a network without a memory, or without a plan; steps that teach the policy nothing, a
@@ -97,7 +99,8 @@ def adapt_by_ppo(
             "scenario": scenario,
             "seed": seed,
         }
-        | ({"plan": list(plan)} if config.adversary.guided else {}),
+        | ({"plan": list(plan)} if config.adversary.guided else {})
+        | ({"origin": network_fingerprint(origin)} if origin is not None and config.adversary.guided else {}),
         checkpoint_seconds,
         track,
     )
@@ -108,7 +111,7 @@ def adapt_by_ppo(
     drive = Drive(make_worlds, ppo.num_envs, stream_seed(seed, "ppo"), lanes)
 
     def make_guide() -> Guide:
-        return Guide(network, plan, ppo, torch_stream(seed, "ppo/guide", device))
+        return Guide(origin or network, plan, ppo, torch_stream(seed, "ppo/guide", device))
 
     collector = Collector(
         drive,
