@@ -64,6 +64,11 @@ MADE = {
         "strong, plan guided",
         _MIXED + "; 1,000,000 online steps, then 153,600 under attack in which it was shown what to do",
     ),
+    "squeezed": Made(
+        "RAPID, squeezed features",
+        "strong, plan squeezed",
+        _MIXED + "; 1,000,000 online steps, then 900,000 by squeezed features, half of them under attack",
+    ),
 }
 LIMITS = (
     "It drives HighwayEnv's straight highway in the scenario named, and nothing else. It is no driver of real cars. "

@@ -52,6 +52,17 @@ def test_a_shipped_agent_drives_as_its_onnx_file_does(name: str):
     assert np.allclose(ours.return_E, theirs.return_E)
 
 
+def test_what_committed_results_go_on_from_is_what_it_was():
+    # Their cells name a shipped agent and know nothing of its weights: whoever ships another measures those rows anew.
+    origins = {
+        "lane-3-density-2/rapid": "7d8cc2e8bfd715b4",
+        "lane-4-density-2.5/rapid": "d14c3b6f275ef58a",
+        "lane-5-density-3/rapid": "0b60a3a58a1e7d21",
+    }
+    for name, digest in origins.items():
+        assert sha256(agent_folder(f"shipped:{name}") / "weights.safetensors").startswith(digest), name
+
+
 def test_names_are_taken_wherever_an_agent_is_expected():
     assert own_scenario(["slower", "shipped:lane-3-density-2/robust"]) == "lane-3-density-2"
     assert open_agent("shipped:lane-3-density-2/robust", "lane-3-density-2").act is not None

@@ -42,7 +42,16 @@ from rapid.experiments.store import Store
 from rapid.experiments.tables import Entry, Table, entry
 from rapid.scenarios import PAPER_SCENARIOS
 
-ROBUST_METHODS = ("slower", "immune", "blind", "online-ppo", "rapid-ppo", "rapid-robust", "rapid-guided")
+ROBUST_METHODS = (
+    "slower",
+    "immune",
+    "blind",
+    "online-ppo",
+    "rapid-ppo",
+    "rapid-robust",
+    "rapid-guided",
+    "rapid-squeezed",
+)
 
 
 STRONGEST = ("pgd:loss=margin", "directed:target=faster", "lie:to=near", "world")
@@ -208,7 +217,16 @@ ALL: dict[str, Exhibit] = {
             "RAPID, its baselines and the floors under the paper's reward.",
             (
                 *("slower", "immune", "blind", "teacher", "offline-dqn", "offline-ddqn", "cql", "bc", "distilled"),
-                *("online-ddqn-10k", "online-ppo", "mlp-ppo", "rapid-10k", "rapid-ppo", "rapid-robust", "rapid-guided"),
+                *(
+                    "online-ddqn-10k",
+                    "online-ppo",
+                    "mlp-ppo",
+                    "rapid-10k",
+                    "rapid-ppo",
+                    "rapid-robust",
+                    "rapid-guided",
+                    "rapid-squeezed",
+                ),
             ),
             recipes=("strong",),
         ),
