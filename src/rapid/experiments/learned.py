@@ -162,8 +162,8 @@ def robust(setting: Setting) -> Adapt:
 
 GUIDED_STEPS = 153_600
 """Environment steps in which a trained agent is shown what to do under attack: 40 rollouts."""
-SQUEEZED_STEPS = 900_000
-"""Environment steps in which a trained agent learns by squeezed features, in the latter half under attack."""
+SQUEEZED_STEPS = 600_000
+"""Environment steps in which a trained agent learns by squeezed features, two thirds of them under attack."""
 
 
 def guided(setting: Setting) -> Adapt:
@@ -176,7 +176,7 @@ def guided(setting: Setting) -> Adapt:
 def squeezed(setting: Setting) -> Adapt:
     """Return RAPID that learns under attack by squeezed features, after its phase 3 by the plan `ppo`."""
     settings = setting.config(plan="squeezed").adapt
-    settings = replace(settings, adversary=replace(settings.adversary, begin=0.45, ramp=0.1))
+    settings = replace(settings, adversary=replace(settings.adversary, begin=0.35, ramp=0.15))
     return _from_trained(setting, settings, SQUEEZED_STEPS, settings.ppo.critic_steps)
 
 
