@@ -67,7 +67,7 @@ MADE = {
     "squeezed": Made(
         "RAPID, squeezed features",
         "strong, plan squeezed",
-        _MIXED + "; 1,000,000 online steps, then 900,000 by squeezed features, half of them under attack",
+        _MIXED + "; 1,000,000 online steps, then 600,000 by squeezed features, two thirds of them under attack",
     ),
 }
 LIMITS = (

@@ -289,8 +289,9 @@ def test_the_plan_robust_adapts_an_agent_on_disk(tmp_path):
         adapt_agent(mirrored, tmp_path / "out" / "agent", None, tmp_path / "mirrored")
 
 
-def test_the_plan_squeezed_reads_squeezed_features_from_ppo_on_and_leaves_policy_1_as_it_was(tmp_path):
+def test_the_plan_squeezed_reads_squeezed_features_from_ppo_on_and_may_leave_policy_1_frozen(tmp_path):
     usual = preset("strong", "tiny", "squeezed")
+    usual = replace(usual, adapt=replace(usual.adapt, train="adapter"))
     small = replace(usual.adapt.ppo, steps=960, critic_steps=240, num_envs=8, batch_size=60)
     config = replace(usual, adapt=replace(usual.adapt, steps=0, ppo=small, evaluate_every=0))
     validate(config)
