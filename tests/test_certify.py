@@ -154,8 +154,8 @@ def test_bounds_hold_through_a_memory_whose_state_is_known(roads: Any, settings:
     place = _memory_of(agent).start_x + state[0, DISTANCE]
     obs[:, 0, 1] = place + torch.tensor([5.5, -5.5 - 0.4 * 3, 0.0, 30.0])
     obs[:, 0, 3] = state[0, SPEED] - torch.tensor([0.0, 1.5, 0.5, 8.0])
-    # One car just where its lane is rounded, so that it is read as on either.
-    obs[1, 1, 0], obs[1, 1, 2] = 1, 2.0
+    # One car near where its lane is rounded, so that within the largest box it is read as on either.
+    obs[1, 1, 0], obs[1, 1, 2] = 1, 2.03
     q = agent.network(obs, state).double()
     exact = bounds.differences(obs, obs, state)
     assert torch.allclose(exact, q[:, :, None] - q[:, None], atol=2e-5)

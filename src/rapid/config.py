@@ -188,7 +188,7 @@ class Config:
     threads: Workers = 1
     """Torch threads of this process; scale by processes instead. Another number gives other weights, in their last bits
     at first. In PPO two or more let policy and critic learn beside each other, and as many processes step its
-    worlds."""
+    compiled worlds; a script then needs `if __name__ == "__main__":` around its work."""
     device: str = "cpu"
     """Torch device."""
     tracking: Literal["none", "tensorboard", "wandb", "trackio"] = "none"

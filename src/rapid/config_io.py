@@ -236,12 +236,12 @@ def weights_about(network: NetworkConfig) -> int:
 def least_steps(adapt: AdaptConfig) -> int:
     """Return the fewest steps of PPO in which the policy learns anything: one rollout after those of the critic alone.
 
-    From a guide that shows what to do from the beginning it learns at once.
+    From a guide that shows what to do in the first of the rollouts planned it learns at once.
     """
-    ppo, guide = adapt.ppo, adapt.adversary
+    ppo = adapt.ppo
     per_rollout = max(ppo.num_envs * ppo.rollout, 1)
-    alone = 0 if guide.guided and not guide.begin else -(-ppo.critic_steps // per_rollout)
-    return (alone + 1) * per_rollout
+    at_once = 0 in adapt.adversary.guided_rollouts(ppo.steps // per_rollout)
+    return per_rollout if at_once else (-(-ppo.critic_steps // per_rollout) + 1) * per_rollout
 
 
 def value(config: Any, name: str) -> Any:

@@ -69,8 +69,8 @@ class NetworkConfig:
     """Give it a memory of what a car knows by itself: the time, its own speed and lanes, dead-reckoned from its own
     actions, which no attack on observations moves. For networks of tokens that do not average with the mirror image."""
     squeeze: bool = False
-    """With a memory: read nothing that an attack within 0.1 could bend far. Of the others that is where along the road
-    and on which lane they are, of the ego which lane; its place and speed are those it remembers."""
+    """With a memory: read little that an attack could bend. Of the others these are place along the road and lane, of
+    the ego its lane; its own place and speed are those it remembers."""
     shield: str = ""
     """Behind the Q-values, the interval filter (`rapid.safety`) that lets an action pass only if it is safe in every
     true state within this of what is seen: a radius such as 0.1, or metres and m/s such as 1m,0.5; nothing is none."""
@@ -256,6 +256,10 @@ class AdversaryConfig:
     do: under attack what a plan says, otherwise what it did before (:mod:`rapid.training.machinery.guide`)."""
     plan: str = ""
     """That plan, as of the driver `blind`, such as 13,2,8; nothing is blind's own in the scenario."""
+
+    def guided_rollouts(self, planned: int) -> range:
+        """Return in which of so many rollouts the policy is shown what to do."""
+        return range(round(self.begin * planned), round((self.begin + self.guided) * planned) if self.guided else 0)
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def _simulator() -> Finding:
     from rapid.simulator.compile import cache_folders, damaged_cache_files
 
     # Beside the simulator's, which others import, these have kernels of their own.
-    for module in ("rapid.networks.layer_kernels", "rapid.teacher.foresight"):
+    for module in ("rapid.networks.layer", "rapid.teacher.foresight", "rapid.teacher.forecast"):
         importlib.import_module(module)
     damaged = [path for folder in cache_folders() for path in damaged_cache_files(folder)]
     start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""The road and its cars in metres and m/s, as highway-env has them; whoever needs one of these numbers takes it here.
+"""The road and its cars in metres and m/s, as highway-env has them: what more than one module needs.
 
 This module imports nothing.
 """
@@ -9,7 +9,7 @@ CAR_LENGTH, CAR_WIDTH = 5.0, 2.0
 """Metres."""
 SIGHT = 200.0
 """Metres along the road within which cars are observed."""
-RANGES = (200.0, LANE_WIDTH, 80.0)
+RANGES = (SIGHT, LANE_WIDTH, 80.0)
 """What 1 means in a normalised feature: metres along, metres across for each lane, m/s (highway-env's own ranges)."""
 START_SPEED = 25.0
 """m/s with which the ego begins an episode."""

@@ -146,9 +146,11 @@ def test_who_begins_to_squeeze_features_is_shown_what_it_did_by_all_of_them(tmp_
     assert (teacher.config.squeeze, agent.network.config.squeeze) == (False, True)
     kept = teacher.state_dict()
     assert all(torch.equal(kept[name], value) for name, value in distilled.state_dict().items())
-    # Who squeezed already goes on from what it did itself.
+    # Who squeezed already goes on from what it did itself, and so does who has learned by the time the guide begins.
     adapt_agent(config, tmp_path / "out" / "agent", None, tmp_path / "on")
-    assert shown[1].config.squeeze
+    late = replace(config, adapt=replace(config.adapt, adversary=replace(first, begin=0.5, guided=0.5)))
+    adapt_agent(late, tmp_path / "agent", None, tmp_path / "late")
+    assert [teacher.config.squeeze for teacher in shown] == [False, True, True]
 
 
 def test_after_the_guide_comes_the_return(tmp_path: Path):
@@ -156,6 +158,10 @@ def test_after_the_guide_comes_the_return(tmp_path: Path):
     rows = lines(tmp_path)
     assert ["shown" in row for row in rows] == [True, True, False, False]
     assert ["value" in row for row in rows] == [False, False, True, True]
+    # From what a guide shows the critic learns nothing: the steps that are its own are counted after it.
+    for steps, learns in ((0, True), (GUIDED.ppo.num_envs * GUIDED.ppo.rollout, False)):
+        train(tmp_path / f"{steps}", replace(GUIDED, ppo=replace(GUIDED.ppo, critic_steps=steps)), plan=PLAN)
+        assert ["policy" in row for row in lines(tmp_path / f"{steps}")] == [False, False, learns, True]
 
 
 @pytest.mark.parametrize(("attention", "squeeze"), [("torch", False), ("compiled", False), ("compiled", True)])
@@ -163,8 +169,10 @@ def test_after_the_guide_comes_the_return(tmp_path: Path):
 def test_a_guided_training_that_was_killed_ends_as_one_that_was_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, attention: Literal["torch", "compiled"], squeeze: bool
 ):
-    # The second and the third of four rollouts are guided; the checkpoint before the third holds a guide.
-    config = replace(GUIDED, adversary=replace(MIXTURE, begin=0.25, guided=0.5))
+    # The second and the third of four rollouts are guided; the checkpoint before the third holds a guide. Who begins to
+    # squeeze features is guided from the first on, by what it was.
+    begin, guided = (0.0, 0.75) if squeeze else (0.25, 0.5)
+    config = replace(GUIDED, adversary=replace(MIXTURE, begin=begin, guided=guided))
     config = replace(config, ppo=replace(config.ppo, attention=attention))
 
     def train(directory: Path, config: AdaptConfig, **options: Any) -> QNetwork:
@@ -233,6 +241,11 @@ def test_bad_guides_are_refused(tmp_path: Path):
     later = replace(long, adversary=replace(at_once, begin=0.5, guided=0.5))
     assert least_steps(short) == rollout < short.ppo.critic_steps < least_steps(later)
     validate(replace(usual, adapt=short))
+    # A guide whose time is less than a rollout never begins.
+    for steps, share in ((rollout, 0.5), (4 * rollout, 0.1)):
+        none = replace(short, ppo=replace(long.ppo, steps=steps), adversary=replace(at_once, guided=share))
+        with pytest.raises(RapidError, match="until the policy learns"):
+            validate(replace(usual, adapt=none))
     unattacked = replace(long, memory=True, adversary=replace(GUIDED.adversary, gradient_share=0.0, noise_share=0.0))
     with pytest.raises(RapidError, match="a plan is shown in attacked episodes"):
         validate(replace(usual, adapt=unattacked))

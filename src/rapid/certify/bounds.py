@@ -27,7 +27,8 @@ from rapid.scenarios import NUM_ACTIONS
 ROUNDING = 1e-4
 """By how much a difference must exceed 0 to count as proven: networks compute in single precision, bounds do not."""
 
-
+NEAR_TIE = 1e-4
+"""Metres by which a box is wider where y is rounded to lanes: the network does that in single precision."""
 CHUNK_PERCEPTRON, CHUNK_TOKENS = 16, 1
 """Observations that are bounded at once. A mixture's forms take hundreds of megabytes each."""
 
@@ -156,7 +157,7 @@ def _squeezed(memory: Memory, seen: Form, state_BS: Tensor) -> Form:
     Presence, and where along the road the others are, stay what they were. Every other entry rises with the one that it
     is made of and depends on nothing else that is seen, so it lies between what the corners of the box give.
     """
-    low_BVF, high_BVF = memory.squeezed(seen.low, state_BS), memory.squeezed(seen.high, state_BS)
+    low_BVF, high_BVF = (memory.squeezed(part, state_BS) for part in (seen.low - NEAR_TIE, seen.high + NEAR_TIE))
     # Speeds are told by presence alone, which is that of the middle.
     low_BVF[..., 3] = high_BVF[..., 3] = memory.squeezed(seen.centre, state_BS)[..., 3]
     kept_VF = torch.zeros_like(low_BVF[0], dtype=torch.bool)

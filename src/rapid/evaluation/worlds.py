@@ -15,6 +15,7 @@ from rapid.attacks.attack import Attack, Field, Moment, Shown, network_of, value
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import time_to_collision
 from rapid.evaluation.recording import Recording
+from rapid.road import LANE_WIDTH
 from rapid.scenarios import ACTIONS, IDLE, NUM_ACTIONS, NUM_VEHICLES
 from rapid.seeding import torch_stream
 from rapid.teacher.decision import Decision, answer_in_words, computed_in_words
@@ -186,5 +187,5 @@ def _time_to_collision(obs_BVF: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _lane(obs_BVF: NDArray[np.float32], lanes: int) -> NDArray[np.int64]:
-    """Return the lane each ego is nearest to; lanes are 4 m wide and their centres at 0, 4, 8 m."""
-    return np.clip(np.rint(obs_BVF[:, 0, 2] / 4.0), 0, lanes - 1).astype(np.int64)
+    """Return the lane each ego is nearest to."""
+    return np.clip(np.rint(obs_BVF[:, 0, 2] / LANE_WIDTH), 0, lanes - 1).astype(np.int64)

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from rapid.road import LANE_WIDTH, RANGES
 from rapid.scenarios import NUM_FEATURES, NUM_VEHICLES
 
-"""Metres."""
 EGO_UNITS = (1.0, 50.0, LANE_WIDTH, 10.0, 5.0)
 """The units of ego-relative features: 50 m along the road, one lane, 10 m/s along, 5 m/s across."""
 NEAR = 10.0

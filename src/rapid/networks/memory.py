@@ -88,7 +88,9 @@ class Recalled(NamedTuple):
 
 
 class Memory(nn.Module):
-    """Reads the state and how far what is seen of the ego differs from it; policy 1 is left as it was distilled.
+    """Reads the state and how far what is seen of the ego differs from it; no policy 1 ever hears of it.
+
+    Where features are squeezed it reads the state alone, and all policies read less (:meth:`squeezed`).
 
     Args:
         config: the network's settings.
@@ -129,8 +131,9 @@ class Memory(nn.Module):
         "Feature squeezing" (Xu et al., 2018), with what is known of roads and cars. Of the ego, place and speed are its
         own; its lane is one that it can be on. Of the others, place and presence are read as they are, y as the middle
         of the nearest lane, and speeds as those of usual traffic. A car in the middle of its lane is read the same
-        unless y is moved by 2 m, and 0.1 are 1.2, 1.6 and 2 m on three, four and five lanes. So what an attack can do
-        is to move cars along the road.
+        unless y is moved by 2 m. An attack of 0.1 moves it by 1.2 and 1.6 m on three and four lanes, so there it can
+        move cars along the road and mislead about who is changing lanes. On five lanes 0.1 are those 2 m, and noise of
+        0.2 reaches farther on every road.
 
         Gradients pass where y is rounded, as if it were not: an attack that follows them is not misled (BPDA; Athalye
         et al., 2018).

@@ -41,7 +41,7 @@ from rapid.simulator.state import (
 
 ROAD_LENGTH = 10_000.0
 SPEED_LIMIT = 30.0
-HALF_LENGTH = 2.5
+HALF_LENGTH = CAR_LENGTH / 2
 
 SPEED_GAIN = 1 / 0.6
 LATERAL_GAIN = 1 / 0.6

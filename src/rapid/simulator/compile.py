@@ -21,11 +21,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @cache
 def kernel_stamp() -> bytes:
-    """Return a digest of every file of RAPID that holds a kernel, or numbers that kernels read."""
+    """Return a digest of every file of RAPID that holds a kernel, or numbers that are compiled into one."""
+    package = Path(__file__).parents[1]
+    numbers = [package / name for name in ("road.py", "scenarios.py", "simulator/state.py")]
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()
-        if b"@kernel" in source or path.name == "road.py":
+        if b"@kernel" in source or path in numbers:
             digest.update(path.name.encode() + b"\0" + source)
     return digest.digest()
 

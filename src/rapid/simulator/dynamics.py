@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
+from rapid.road import CAR_WIDTH, LANE_WIDTH
 from rapid.simulator.behavior import HALF_LENGTH, ROAD_LENGTH, wrap_angle
 from rapid.simulator.compile import dot, kernel
-from rapid.simulator.spawn import LANE_WIDTH
 from rapid.simulator.state import (
     ACCELERATION,
     COS,
@@ -34,7 +34,7 @@ from rapid.simulator.state import (
 )
 
 TOP_SPEED = 40.0
-HALF_WIDTH = 1.0
+HALF_WIDTH = CAR_WIDTH / 2
 DIAGONAL = math.sqrt(29.0)
 CANDIDATES = 64
 """Pairs of vehicles close enough to be examined that a frame keeps; beyond that, all pairs are examined."""

@@ -170,7 +170,7 @@ class WorldPool:
             raise RapidError(
                 f"A process of the simulator {how} while starting. A script that asks for several processes must begin "
                 "its work below `if __name__ == '__main__':`, because each process imports the script. Otherwise use "
-                "processes=1."
+                "processes=1, or threads=1 where a training asked for them."
             )
         raise RapidError(
             f"A process of the simulator {how}, so some worlds are lost. Make the environment anew; if memory ran out, "

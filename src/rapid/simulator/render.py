@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
-from rapid.road import LANE_WIDTH
+from rapid.road import CAR_LENGTH, CAR_WIDTH, LANE_WIDTH
 from rapid.simulator.settings import Settings, read_integer
 from rapid.simulator.state import (
     COS,
@@ -40,7 +40,7 @@ GLASS: Color = (38, 42, 50)
 SIGNAL: Color = (255, 140, 26)
 HEADER: Color = (30, 33, 39)
 
-LENGTH, WIDTH = 5.0, 2.0
+LENGTH, WIDTH = CAR_LENGTH, CAR_WIDTH
 VERGE = 2.5
 """Metres of grass beside the road."""
 HEADER_HEIGHT = 28

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.errors import RapidError
-from rapid.road import CAR_LENGTH, LANE_WIDTH
+from rapid.road import CAR_LENGTH, CAR_WIDTH, LANE_WIDTH
 from rapid.scenarios import ACTIONS, FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from rapid.simulator.behavior import ROAD_LENGTH, reachable
 from rapid.simulator.settings import USE_REFERENCE, Settings
@@ -44,7 +44,7 @@ class HasWorld(Protocol):
 class VehicleView:
     """One vehicle as highway-env's scripts read it; the ego is the first."""
 
-    LENGTH, WIDTH, MAX_SPEED = 5.0, 2.0, 40.0
+    LENGTH, WIDTH, MAX_SPEED = CAR_LENGTH, CAR_WIDTH, 40.0
     """m, m, m/s."""
 
     __slots__ = ("_index", "_owner")

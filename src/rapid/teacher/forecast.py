@@ -5,15 +5,14 @@ driver model with the simulator's default parameters, finishes the lane change t
 wants to drive as fast as cars here do. The ego tracks its target speed and lane as the simulator's own controller does.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from rapid.road import CAR_LENGTH, CAR_WIDTH, LANE_WIDTH
 from rapid.scenarios import NUM_ACTIONS
+from rapid.simulator.compile import kernel
 from rapid.teacher.scene import LATERAL_TIME, Scene
 
 HORIZON = 4.0
@@ -24,18 +23,6 @@ CRUISE = 22.5
 """Mean speed at which the simulator spawns traffic, and which a slower driver is taken to want, m/s."""
 NO_CAR = 99.0
 """The gap given when no car comes near, m."""
-
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def _kernel(function: Function) -> Function:
-    """Compile with numba; keep the machine code on disk where a directory for it can be written."""
-    options: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-    try:
-        return cast(Function, numba.njit(cache=True, **options)(function))
-    except RuntimeError:  # numba found no place for its cache
-        return cast(Function, numba.njit(**options)(function))
 
 
 class Forecast(NamedTuple):
@@ -60,7 +47,7 @@ def forecast(scene: Scene) -> tuple[Forecast, ...]:
     return tuple(Forecast(*row) for row in result_A4.tolist())
 
 
-@_kernel
+@kernel
 def _idm(
     i: int,
     x: NDArray[np.float64],
@@ -85,7 +72,7 @@ def _idm(
     return min(max(acceleration, -6.0), 6.0)
 
 
-@_kernel
+@kernel
 def _follow(
     cars_V5: NDArray[np.float64], speed: float, side: float, lane: float, target: float, braking: bool
 ) -> tuple[float, float]:  # pragma: no cover - compiled
@@ -120,7 +107,7 @@ def _follow(
     return smallest, np.inf
 
 
-@_kernel
+@kernel
 def _roll_out(
     cars_V5: NDArray[np.float64],
     speed: float,

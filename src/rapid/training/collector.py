@@ -185,12 +185,12 @@ class Collector:
         after = done / planned - mixture.begin
         ramp = 0.0 if make_guide else mixture.ramp
         self._size = min(max(after, 0.0) / ramp, 1.0) if ramp else float(after >= 0)
-        first, last = round(mixture.begin * planned), round((mixture.begin + mixture.guided) * planned)
-        if make_guide is None or not first <= done < last:
+        guided = mixture.guided_rollouts(planned)
+        if make_guide is None or done not in guided:
             self.guide = None
         else:
             self.guide = self.guide or make_guide()
-            self.guide.left = (last - done) / (last - first)
+            self.guide.left = (guided.stop - done) / len(guided)
             self._size = 1.0
         return self.guide
 

@@ -64,7 +64,8 @@ def adapt_by_ppo(
         checkpoint_seconds: time between two checkpoints.
         track: is given every row of metrics; their steps go on from `config.steps`.
         plan: the actions of an episode that a guide shows under attack (`config.adversary.guided`).
-        origin: the policy that it shows where nobody attacks; None is the network as it is when the guide begins.
+        origin: the policy that a guide from the first rollout on shows where nobody attacks. Without it, and later, it
+            is the network as it is when the guide begins.
 
     Raises:
         RapidError: a guide for a network without a memory, or without a plan; steps that teach the policy nothing, a
@@ -88,6 +89,8 @@ def adapt_by_ppo(
     per_rollout = ppo.num_envs * ppo.rollout
     # No more than asked for: whole rollouts would otherwise go beyond a budget.
     rollouts = ppo.steps // per_rollout
+    # What is learned before a later guide begins is not to be unlearned.
+    before = origin if 0 in config.adversary.guided_rollouts(rollouts) else None
     device = str(next(network.parameters()).device)
     record = Record(
         directory,
@@ -100,7 +103,7 @@ def adapt_by_ppo(
             "seed": seed,
         }
         | ({"plan": list(plan)} if config.adversary.guided else {})
-        | ({"origin": network_fingerprint(origin)} if origin is not None and config.adversary.guided else {}),
+        | ({"origin": network_fingerprint(before)} if before is not None else {}),
         checkpoint_seconds,
         track,
     )
@@ -111,7 +114,7 @@ def adapt_by_ppo(
     drive = Drive(make_worlds, ppo.num_envs, stream_seed(seed, "ppo"), lanes)
 
     def make_guide() -> Guide:
-        return Guide(origin or network, plan, ppo, torch_stream(seed, "ppo/guide", device))
+        return Guide(network if before is None else before, plan, ppo, torch_stream(seed, "ppo/guide", device))
 
     collector = Collector(
         drive,
@@ -122,7 +125,7 @@ def adapt_by_ppo(
         device,
         make_guide if config.adversary.guided else None,
     )
-    before = -(-config.steps // config.num_envs) * config.num_envs
+    earlier = -(-config.steps // config.num_envs) * config.num_envs
     done = 0
 
     def state() -> dict[str, Any]:
@@ -143,7 +146,7 @@ def adapt_by_ppo(
             guide = collector.guide
             learner.update(rollout, guide.left if guide else 1.0)
         done += 1
-        steps, last = before + done * per_rollout, done == rollouts
+        steps, last = earlier + done * per_rollout, done == rollouts
         row = {
             "step": steps,
             "updates": learner.updates,

@@ -57,7 +57,8 @@ class PpoLearner:
         self._adam, self._critic_adam = Adam(self._trained, rates), Adam(self._critics)
         self._rng = numpy_stream(seed, "ppo/minibatches")
         self._beside = torch.get_num_threads() > 1 and device.type == "cpu"
-        self.rollouts = self.updates = 0
+        self.rollouts = self.updates = self.taught = 0
+        """Rollouts that were learned from, the minibatches in them, and rollouts from which the critic learned."""
         self._values: list[Tensor] = []
         self._terms: list[Tensor] = []
         self._shown: list[Tensor] = []
@@ -65,7 +66,7 @@ class PpoLearner:
     @property
     def learning_rate(self) -> float:
         """The policy's step size with the next rollout; 0 while the critic learns what this policy is worth."""
-        if self.rollouts * self.config.num_envs * self.config.rollout < self.config.critic_steps:
+        if self.taught * self.config.num_envs * self.config.rollout < self.config.critic_steps:
             return 0.0
         return self.config.learning_rate * max(1 - self.rollouts / self.planned, 0.0)
 
@@ -135,6 +136,7 @@ class PpoLearner:
             self._teach_policy(rollout, minibatches)
         self.updates += len(minibatches)
         self.rollouts += 1
+        self.taught += rollout.shown_NA is None
 
     def _frozen_tokens(self, rollout: Rollout) -> Tensor | None:
         """Return what policy 1 makes of the whole rollout, where it is not trained: it is needed in every pass."""
@@ -222,6 +224,7 @@ class PpoLearner:
             "rng": self._rng.bit_generator.state,
             "rollouts": self.rollouts,
             "updates": self.updates,
+            "taught": self.taught,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -232,6 +235,8 @@ class PpoLearner:
         self._critic_adam.load_state_dict(state["critic_adam"])
         self._rng.bit_generator.state = state["rng"]
         self.rollouts, self.updates = state["rollouts"], state["updates"]
+        # Earlier checkpoints counted all rollouts.
+        self.taught = state.get("taught", self.rollouts)
 
 
 def without_clock(obs_BVF: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ class Guide:
     """Shows each world's policy the probabilities it is to have, and drives some of the episodes by them.
 
     Args:
-        network: the policy as it is before the attacks; it is copied.
+        network: the policy whose actions are shown where nobody attacks, as it was before the attacks; it is copied.
         plan: the actions of an episode under attack; IDLE follows the last.
         config: T of the policy softmax(Q / T), and W.
         generator: the source of all its chance; whoever resumes sets its state.
