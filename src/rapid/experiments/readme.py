@@ -27,7 +27,7 @@ from rapid.files import write_text
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
 BLOCK = re.compile(r"(<!-- table: ([\w:-]+) -->\n).*?(<!-- end -->)", re.S)
-WORKS = ("slower", "blind", "teacher", "offline-dqn", "rapid-ppo", "rapid-robust", "rapid-guided", "rapid-squeezed")
+WORKS = ("slower", "blind", "teacher", "offline-dqn", "rapid-ppo", "rapid-guided", "rapid-squeezed")
 """Rows of README's table; the paper's own row stands above them."""
 
 
