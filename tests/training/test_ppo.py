@@ -180,7 +180,7 @@ def test_policy_and_critic_learn_beside_each_other_with_the_same_result():
         try:
             torch.set_num_threads(threads)
             learner = PpoLearner(network(), PPO, 1.0, False, 0, 4)
-            learner.rollouts = 1
+            learner.rollouts = learner.taught = 1
             with learner.computing():
                 assert torch.get_num_threads() == 1
                 learner.update(collect(learner, Drive(worlds, PPO.num_envs, 1), PPO))
