@@ -28,6 +28,8 @@ from rapid.report.sweep import sweep_figure
 FLOORS = ("slower", "immune", "blind")
 """Drivers that no lie about other cars misleads; drawn as squares."""
 COLORS = ("#1f6f8b", "#6b57b8", "#d0672a", "#3c8f4e", "#b33a67", "#8a939b", "#4a525a", "#8b7a2b")
+MARKERS = "oD^v"
+"""Where colours begin anew, other marks do as well: no two agents look the same."""
 
 
 class Point(NamedTuple):
@@ -77,7 +79,7 @@ def trade_off(rows: Sequence[EpisodeRow]) -> Figure:
             yerr=spread[1],
             xerr=spread[0],
             color=COLORS[place % len(COLORS)],
-            marker="s" if point.agent in FLOORS else "o",
+            marker="s" if point.agent in FLOORS else MARKERS[place // len(COLORS) % len(MARKERS)],
             linestyle="none",
             markersize=6,
             elinewidth=1,

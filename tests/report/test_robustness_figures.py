@@ -42,6 +42,13 @@ def test_an_agents_point_is_its_clean_mean_and_the_mean_of_its_least_returns(fig
     assert "2.5" in figures.table(rows)
 
 
+def test_no_two_agents_look_the_same(figures: Any):
+    rows = [row for name in range(20) for row in rows_of(f"agent {name}", "none", [name, name + 1])]
+    axes = figures.trade_off(rows).axes[0]
+    looks = {(container[0].get_color(), container[0].get_marker()) for container in axes.containers}
+    assert len(looks) == len(axes.containers) == 20
+
+
 def test_rows_of_two_roads_and_agents_without_clean_rows_are_refused(figures: Any):
     with pytest.raises(RapidError, match="of one scenario"):
         figures.points(rows_of("bold", "none", [1]) + rows_of("bold", "none", [1], "lane-4-density-2.5"))
