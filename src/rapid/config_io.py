@@ -171,12 +171,12 @@ def validate(config: Config) -> Config:
             f"at most {MOST_ROWS} together with adapt.ppo.num_envs = {adapt.ppo.num_envs}, as a product",
         ),
         ("network.memory", not network.memory, "false: offline data holds no memory, adapt.memory gives one"),
+        ("network.squeeze", not network.squeeze, "false: it needs a memory, adapt.squeeze gives it"),
         (
-            "network.squeeze",
-            not network.squeeze,
-            "false: it needs a memory, adapt.squeeze gives it",
+            "adapt.squeeze",
+            not adapt.squeeze or adapt.memory,
+            "false where adapt.memory is false: the ego's place and speed are then those of the memory. Set both",
         ),
-        ("adapt.squeeze", not adapt.squeeze or adapt.memory, "false where adapt.memory is false"),
         ("adapt.memory", not adapt.memory or adapt.ppo.steps > 0, "false where adapt.ppo.steps is 0"),
         ("adapt.memory", not (adapt.memory and (adapt.mirror or network.mirror)), "false where the road is mirrored"),
         (

@@ -69,8 +69,8 @@ class NetworkConfig:
     """Give it a memory of what a car knows by itself: the time, its own speed and lanes, dead-reckoned from its own
     actions, which no attack on observations moves. For networks of tokens that do not average with the mirror image."""
     squeeze: bool = False
-    """With a memory: read little that an attack could bend. Of the others these are place along the road and lane, of
-    the ego its lane; its own place and speed are those it remembers."""
+    """With a memory: read only what an attack can hardly bend. That is where along the road and on which lane each
+    other car is, and the ego's lane. The ego's place and speed are those it remembers."""
     shield: str = ""
     """Behind the Q-values, the interval filter (`rapid.safety`) that lets an action pass only if it is safe in every
     true state within this of what is seen: a radius such as 0.1, or metres and m/s such as 1m,0.5; nothing is none."""

@@ -156,11 +156,11 @@ class Memory(nn.Module):
         can move. And by how much the ego's seen speed and place differ from what is known; 0 where features are
         squeezed.
         """
-        ego_BF = obs_BVF[:, 0]
-        faster_B = ego_BF[:, 3] - state_BS[:, SPEED]
-        farther_B = ego_BF[:, 1] - state_BS[:, DISTANCE] - self.start_x
         if self.squeeze:
-            faster_B, farther_B = torch.zeros_like(faster_B), torch.zeros_like(farther_B)
+            faster_B = farther_B = torch.zeros_like(state_BS[:, SPEED])
+        else:
+            faster_B = obs_BVF[:, 0, 3] - state_BS[:, SPEED]
+            farther_B = obs_BVF[:, 0, 1] - state_BS[:, DISTANCE] - self.start_x
         most = max(self.lanes - 1, 1)
         present_B = (obs_BVF[..., 0] > 0.5).sum(1) / obs_BVF.shape[1]
         numbers_BK = torch.stack(
