@@ -8,10 +8,11 @@ is done on offsets in normalised features, which are added to the raw observatio
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from rapid.config_learning import RobustConfig
+from rapid.networks.blocks import spared_weights
 from rapid.networks.denormals import no_denormals
 
 ROUNDING = 1e-5
@@ -41,7 +42,8 @@ def maximize_loss(
         generator: for the random start.
     """
     # Evaluation calls this from inference mode, in which no gradient could be taken.
-    with torch.inference_mode(False), torch.enable_grad(), no_denormals():
+    networks = [network] if isinstance(network, nn.Module) else []
+    with torch.inference_mode(False), torch.enable_grad(), no_denormals(), spared_weights(*networks):
         obs_BVF, labels_BA = obs_BVF.detach().clone(), labels_BA.detach().clone()
         free_F = torch.ones_like(scale_F)
         if not config.attack_presence:

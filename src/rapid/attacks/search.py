@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rapid.attacks.draws import Source, chosen, normal, uniform
+from rapid.networks.blocks import compiled_layers, spared_weights
 from rapid.networks.denormals import no_denormals
 
 Values = Callable[[Tensor], Tensor]
@@ -176,17 +177,12 @@ def step_length(radius: float, step: int) -> float:
 
 @contextmanager
 def for_gradients(values: Values) -> Generator[None]:
-    """Allow gradients by the observations, and spare those by the weights."""
-    module: Any = values.network if isinstance(values, AtState) else values
-    weights = [p for p in module.parameters() if p.requires_grad] if isinstance(module, nn.Module) else []
+    """Allow gradients by the observations, spare those by the weights, and compute layers fast where that is known."""
+    network: Any = values.network if isinstance(values, AtState) else values
+    networks = [network] if isinstance(network, nn.Module) else []
     with torch.inference_mode(False), torch.enable_grad(), no_denormals():
-        for weight in weights:
-            weight.requires_grad_(False)
-        try:
+        with spared_weights(*networks), compiled_layers(*networks):
             yield
-        finally:
-            for weight in weights:
-                weight.requires_grad_(True)
 
 
 @torch.no_grad()

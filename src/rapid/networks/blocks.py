@@ -123,6 +123,22 @@ def compiled_layers(*networks: nn.Module) -> Generator[None]:
             each.compiled = was
 
 
+@contextmanager
+def spared_weights(*networks: nn.Module) -> Generator[None]:
+    """Let no gradient be taken by the weights of some networks meanwhile.
+
+    An attack needs none of them, and compiled layers cannot know what a gradient will be taken of.
+    """
+    weights = [weight for network in networks for weight in network.parameters() if weight.requires_grad]
+    for weight in weights:
+        weight.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for weight in weights:
+            weight.requires_grad_(True)
+
+
 class Transformer(nn.Module):
     """A stack of blocks and a closing LayerNorm."""
 

@@ -10,6 +10,7 @@ from rapid.config_learning import LossConfig, OptimizerConfig
 from rapid.data.batch import TransitionBatch
 from rapid.errors import RapidError
 from rapid.losses import behavior_cloning_loss, q_loss
+from rapid.networks.blocks import compiled_layers
 from rapid.networks.q_network import QNetwork
 from rapid.training.machinery.adam import Adam, clip_norm
 from rapid.training.machinery.capture import CapturedStep
@@ -64,8 +65,9 @@ class Learner:
         """Take one gradient step on the batch (paper: equation 5)."""
         if self._step_size is not None:
             self._step_size.fill_(self.learning_rate)
-        # Kept as a tensor: asking for its value would make every step wait for the device.
-        self._terms.append(self._step(batch))
+        with compiled_layers(self.network, self.target):
+            # Kept as a tensor: asking for its value would make every step wait for the device.
+            self._terms.append(self._step(batch))
         self.updates += 1
         if self.updates % self.config.target_update == 0:
             self._update_target()

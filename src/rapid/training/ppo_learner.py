@@ -17,7 +17,7 @@ from torch import Tensor
 from rapid.config_learning import NetworkConfig, PpoConfig
 from rapid.errors import RapidError
 from rapid.losses import policy_gradient_loss
-from rapid.networks.blocks import compiled_layers
+from rapid.networks.blocks import compiled_layers, spared_weights
 from rapid.networks.denormals import no_denormals
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.seeding import numpy_stream, stream_seed
@@ -90,16 +90,8 @@ class PpoLearner:
 
     def q_values(self, seen_BVF: Tensor, state_BS: Tensor | None = None) -> Tensor:
         """Return the policy's Q-values (B, A); their gradient goes to what is seen, and not to compiled weights."""
-        compiled = self.config.attention == "compiled"
-        # Compiled layers cannot know what a gradient will be taken of.
-        spared = [weight for weight in self._trained if weight.requires_grad] if compiled else []
-        for weight in spared:
-            weight.requires_grad_(False)
-        try:
+        with spared_weights(*([self.network] if self.config.attention == "compiled" else [])):
             return self.network(seen_BVF, state_BS)
-        finally:
-            for weight in spared:
-                weight.requires_grad_(True)
 
     def log_probs(self, seen_BVF: Tensor, state_BS: Tensor | None = None, first_BVD: Tensor | None = None) -> Tensor:
         """Return the policy's log-probabilities (B, A) = log softmax(Q / T) for what it sees and remembers.
