@@ -28,6 +28,9 @@ PLANNERS = ("planner", "planner-cars", "planner-observation")
 SHIELD = "shield:"
 """How the spec of an agent behind the interval filter begins."""
 
+MONITORED = "monitored:"
+"""How the spec of two agents with a monitor between them begins (:mod:`rapid.monitor`)."""
+
 Said = tuple[NDArray[np.float32] | None, Decision | None]
 """The values of the actions, if the driver has any, and its decision, if it is one that speaks."""
 
@@ -75,6 +78,11 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
         lanes = get_scenario(scenario).lanes
         read_box(box, lanes)
         return shielded(open_agent(inner, scenario, seed, device), box, lanes)
+    if spec.startswith(MONITORED):
+        from rapid.agents.monitored import MonitoredAgent, monitored_parts
+
+        calm, wary = (open_agent(each, scenario, seed, device) for each in monitored_parts(spec))
+        return MonitoredAgent(calm, wary, scenario)
     if is_defence(spec):
         from rapid.agents.defended import defended
 
@@ -90,6 +98,10 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
             return PlannerAgent()
         return CarsPlanner(seed=seed) if spec == "planner-cars" else ObservationPlanner(scenario, seed=seed)
     if is_shipped(spec) or Path(spec).is_dir():
+        from rapid.agents.monitored import is_monitored, load_monitored
+
+        if is_monitored(spec):
+            return load_monitored(spec, device)
         agent = rapid.load_agent(spec, device)
         if agent.metadata.get("adversary_of"):
             raise RapidError(

@@ -76,6 +76,23 @@ def next_state(state_BS: NDArray[np.float32], action_B: NDArray[np.int64], lanes
     ).astype(np.float32)
 
 
+def start_x(lanes: int) -> float:
+    """Return where along the road highway-env places the ego, within 2.5 % [m]: four gaps of twice the usual length."""
+    return 4 * 2 * (12 + START_SPEED) * math.exp(-lanes / 8)
+
+
+def ego_bounds(state_BS: Tensor, lanes: int) -> tuple[Tensor, Tensor]:
+    """Return the least and the most that x, y, vx and vy of the ego can be (B, 4), by what is known of it.
+
+    Its place along the road is that of its start and what it drove, its speed its own; of y nothing is said.
+    """
+    place_B, speed_B = start_x(lanes) + state_BS[:, DISTANCE], state_BS[:, SPEED]
+    late_B = place_B - START_TOLERANCE - DELAY * state_BS[:, STEPS]
+    any_B, most_B = torch.full_like(late_B, torch.inf), speed_B + ROUNDING
+    lowest_B4 = torch.stack([late_B, -any_B, speed_B - SLANT, -most_B], 1)
+    return lowest_B4, torch.stack([place_B + START_TOLERANCE, any_B, most_B, most_B], 1)
+
+
 class Recalled(NamedTuple):
     """What memory adds inside the network; zeros as long as it has learned nothing."""
 
@@ -104,8 +121,7 @@ class Memory(nn.Module):
         self.hidden = nn.Linear(KNOWN, HIDDEN)
         self.out = nn.Linear(HIDDEN, 2 * config.width + policies, bias=False)
         self.sizes = [config.width, config.width, policies]
-        # Where highway-env places the ego, within 2.5 %: four gaps of twice the usual length down the road.
-        self.start_x = 4 * 2 * (12 + START_SPEED) * math.exp(-lanes / 8)
+        self.start_x = start_x(lanes)
 
     def believed(self, obs_BVF: Tensor, state_BS: Tensor) -> Tensor:
         """Return the observations (B, V, F) with the ego's own row within what is known of it.
@@ -117,11 +133,7 @@ class Memory(nn.Module):
         """
         if self.squeeze:
             return self.squeezed(obs_BVF, state_BS)
-        place_B, speed_B = self.start_x + state_BS[:, DISTANCE], state_BS[:, SPEED]
-        late_B = place_B - START_TOLERANCE - DELAY * state_BS[:, STEPS]
-        lowest_B4 = torch.stack([late_B, torch.full_like(late_B, -torch.inf), speed_B - SLANT, -speed_B - ROUNDING], 1)
-        most_B = speed_B + ROUNDING
-        highest_B4 = torch.stack([place_B + START_TOLERANCE, torch.full_like(late_B, torch.inf), most_B, most_B], 1)
+        lowest_B4, highest_B4 = ego_bounds(state_BS, self.lanes)
         ego_B4 = torch.minimum(torch.maximum(obs_BVF[:, 0, 1:], lowest_B4), highest_B4)
         return torch.cat([torch.cat([obs_BVF[:, 0, :1], ego_B4], 1)[:, None], obs_BVF[:, 1:]], 1)
 

@@ -1,0 +1,192 @@
+"""Two agents as one, with a monitor between them (:mod:`rapid.monitor`); and such agents on disk."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rapid.agents.q_agent import check_observations
+from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent, noticed, remembers
+from rapid.agents.shipped import agent_folder
+from rapid.agents.watchable import Watchable
+from rapid.attacks.attack import network_of
+from rapid.errors import RapidError
+from rapid.evaluation.metrics import Kind
+from rapid.files import read_json, write_json
+from rapid.monitor import MonitoredNetwork
+from rapid.networks.memory import STATE_SIZE, initial_state, next_state
+from rapid.scenarios import NUM_VEHICLES, get_scenario
+from rapid.text import printable
+
+MONITORED = "monitored:"
+"""How the spec of two agents with a monitor begins."""
+FORMAT, VERSION = "rapid-monitored-agent", 1
+CALM, WARY = "calm", "wary"
+"""Where, within the directory of a saved one, the two agents lie."""
+
+
+def monitored_parts(spec: str) -> tuple[str, str]:
+    """Return the specs of the calm and of the wary agent of a spec such as ``monitored:CALM,WARY``.
+
+    Raises:
+        RapidError: it does not name two.
+    """
+    calm, _, wary = spec.removeprefix(MONITORED).rpartition(",")
+    if not calm.strip() or not wary.strip():
+        raise RapidError(
+            f"'{spec}' does not name two agents. Expected monitored:CALM,WARY: who drives while what is seen can be "
+            "true, and who drives once it cannot."
+        )
+    return calm.strip(), wary.strip()
+
+
+class MonitoredAgent(Watchable):
+    """Drives by the calm agent until something that it sees cannot be true, and then by the wary one.
+
+    Args:
+        calm: an agent with a network: a saved one, perhaps behind a filter or a defence.
+        wary: another.
+        scenario: where it drives.
+        metadata: what was saved with it; a `name` there is its own.
+
+    Raises:
+        RapidError: one of them has no network, or they read different numbers of vehicles.
+    """
+
+    kind: Kind = "learned"
+    has_memory = True
+
+    def __init__(self, calm: Any, wary: Any, scenario: str, metadata: dict[str, Any] | None = None) -> None:
+        self.calm, self.wary, self.metadata = calm, wary, metadata or {}
+        names = [str(getattr(agent, "name", type(agent).__name__)) for agent in (calm, wary)]
+        self.name = str(self.metadata.get("name") or f"{MONITORED}{','.join(names)}")
+        rows = [int(getattr(agent, "vehicles", NUM_VEHICLES)) for agent in (calm, wary)]
+        if rows[0] != rows[1]:
+            raise RapidError(
+                f"'{names[0]}' reads {rows[0]} vehicles and '{names[1]}' {rows[1]}. A monitor needs two agents that "
+                "read as many."
+            )
+        self.vehicles = rows[0]
+        size = calm.start(1).shape[1] if remembers(calm) else 0
+        lanes = get_scenario(scenario).lanes
+        self.network = MonitoredNetwork(*map(_network, (calm, wary), names), size, self.vehicles, lanes).eval()
+
+    @property
+    def remembered_lanes(self) -> int:
+        """On roads with how many lanes its memory is right."""
+        return self.network.lanes
+
+    def act(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the greedy actions (B,)."""
+        return self.q_values(obs_BVF, state_BS).argmax(1)
+
+    @torch.inference_mode()
+    def q_values(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the Q-values (B, A) of the policy that drives."""
+        return self.network(self._seen(obs_BVF), self._tensor(state_BS)).cpu().numpy()
+
+    @torch.inference_mode()
+    def doubts(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return whether the wary agent drives (B,)."""
+        return self.network.doubts(self._seen(obs_BVF), self._tensor(state_BS)).cpu().numpy()
+
+    def start(self, worlds: int) -> NDArray[np.float32]:
+        """Return the states (B, S) with which episodes begin."""
+        own_BS = np.zeros((worlds, self.network.own_size), np.float32)
+        own_BS[:, 1 : 1 + STATE_SIZE] = initial_state(worlds, self.network.lanes)
+        inner = [agent.start(worlds) for agent in (self.calm, self.wary) if remembers(agent)]
+        return np.concatenate([own_BS, *inner], 1)
+
+    def notice(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the states (B, S) after this was seen."""
+        own_BS, calm_BS, wary_BS = self._split(state_BS)
+        own_BS[:, 0] = self.doubts(obs_BVF, state_BS)
+        own_BS[:, 1 + STATE_SIZE :] = obs_BVF.reshape(len(obs_BVF), -1)
+        return np.concatenate([own_BS, noticed(self.calm, obs_BVF, calm_BS), noticed(self.wary, obs_BVF, wary_BS)], 1)
+
+    def remember(self, state_BS: NDArray[np.float32], action_B: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the states (B, S) after these actions."""
+        own_BS, *inner = self._split(state_BS)
+        own_BS[:, 1 : 1 + STATE_SIZE] = next_state(own_BS[:, 1 : 1 + STATE_SIZE], action_B, self.network.lanes)
+        moved = [
+            agent.remember(inner_BS, action_B) if remembers(agent) else inner_BS
+            for agent, inner_BS in zip((self.calm, self.wary), inner, strict=True)
+        ]
+        return np.concatenate([own_BS, *moved], 1)
+
+    def _split(self, state_BS: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        own = self.network.own_size
+        return np.split(state_BS.copy(), [own, own + self.network.calm_size], 1)
+
+    def _seen(self, obs_BVF: NDArray[np.float32]) -> Tensor:
+        return self._tensor(check_observations(obs_BVF, self.name, self.vehicles))
+
+    def _tensor(self, values: NDArray[np.float32]) -> Tensor:
+        device = next(self.network.parameters()).device
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
+
+
+def _network(agent: Any, name: str) -> torch.nn.Module:
+    network = network_of(agent)
+    if network is None:
+        raise RapidError(
+            f"'{name}' has no network, and a monitor stands between two policies that have. Give a saved agent, alone "
+            "or with shield:BOX: or a defence before it."
+        )
+    return network
+
+
+def save_monitored(directory: str | os.PathLike[str], calm: Path, wary: Path, metadata: dict[str, Any]) -> None:
+    """Write two saved agents with a monitor between them to `directory`, as ``calm``, ``wary`` and ``config.json``.
+
+    Args:
+        directory: made if needed; an agent already there is replaced.
+        calm: the directory of a saved agent, or the name of one that is shipped.
+        wary: that of another.
+        metadata: plain JSON values: how it was made; `scenario` tells where it drives.
+
+    Raises:
+        RapidError: one of them cannot be read or does not fit the other, or the directory cannot be written.
+    """
+    MonitoredAgent(load_agent(calm), load_agent(wary), metadata["scenario"])
+    folder = Path(directory)
+    for name, source in ((CALM, calm), (WARY, wary)):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for file in (WEIGHTS_FILE, CONFIG_FILE):
+            shutil.copyfile(agent_folder(source) / file, folder / name / file)
+    write_json(folder / CONFIG_FILE, {"format": FORMAT, "version": VERSION, "metadata": metadata})
+
+
+def is_monitored(directory: str | os.PathLike[str]) -> bool:
+    """Whether :func:`save_monitored` wrote this directory, or a shipped agent of this name."""
+    path = agent_folder(directory) / CONFIG_FILE
+    if not path.is_file():
+        return False
+    config = read_json(path, "agent")
+    return isinstance(config, dict) and config.get("format") == FORMAT
+
+
+def load_monitored(directory: str | os.PathLike[str], device: str = "cpu") -> MonitoredAgent:
+    """Read what :func:`save_monitored` wrote.
+
+    Raises:
+        RapidError: it is damaged, of another version, or does not fit this program.
+    """
+    folder = agent_folder(directory)
+    config = read_json(folder / CONFIG_FILE, "agent")
+    metadata = config.get("metadata")
+    if config.get("version") != VERSION:
+        raise RapidError(
+            f"The agent '{folder}' has format version {config.get('version')}, but this program reads version "
+            f"{VERSION}. Use the program's version that wrote it, or make it again."
+        )
+    if not isinstance(metadata, dict) or not isinstance(metadata.get("scenario"), str):
+        raise RapidError(f"The agent '{folder}' is damaged: {CONFIG_FILE} does not tell its scenario. Save it again.")
+    metadata["name"] = printable(str(metadata.get("name") or folder.resolve().name))
+    calm, wary = (load_agent(folder / name, device) for name in (CALM, WARY))
+    return MonitoredAgent(calm, wary, metadata["scenario"], metadata)
