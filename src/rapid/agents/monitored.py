@@ -10,8 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rapid.agents.open import MONITORED
 from rapid.agents.q_agent import check_observations
-from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent, noticed, remembers
+from rapid.agents.saved import CONFIG_FILE, MONITORED_FORMAT, WEIGHTS_FILE, load_agent, noticed, remembers
 from rapid.agents.shipped import agent_folder
 from rapid.agents.watchable import Watchable
 from rapid.attacks.attack import network_of
@@ -23,26 +24,9 @@ from rapid.networks.memory import STATE_SIZE, initial_state, next_state
 from rapid.scenarios import NUM_VEHICLES, get_scenario
 from rapid.text import printable
 
-MONITORED = "monitored:"
-"""How the spec of two agents with a monitor begins."""
-FORMAT, VERSION = "rapid-monitored-agent", 1
+VERSION = 1
 CALM, WARY = "calm", "wary"
 """Where, within the directory of a saved one, the two agents lie."""
-
-
-def monitored_parts(spec: str) -> tuple[str, str]:
-    """Return the specs of the calm and of the wary agent of a spec such as ``monitored:CALM,WARY``.
-
-    Raises:
-        RapidError: it does not name two.
-    """
-    calm, _, wary = spec.removeprefix(MONITORED).rpartition(",")
-    if not calm.strip() or not wary.strip():
-        raise RapidError(
-            f"'{spec}' does not name two agents. Expected monitored:CALM,WARY: who drives while what is seen can be "
-            "true, and who drives once it cannot."
-        )
-    return calm.strip(), wary.strip()
 
 
 class MonitoredAgent(Watchable):
@@ -74,7 +58,8 @@ class MonitoredAgent(Watchable):
         self.vehicles = rows[0]
         size = calm.start(1).shape[1] if remembers(calm) else 0
         lanes = get_scenario(scenario).lanes
-        self.network = MonitoredNetwork(*map(_network, (calm, wary), names), size, self.vehicles, lanes).eval()
+        networks = _network(calm, names[0]), _network(wary, names[1])
+        self.network = MonitoredNetwork(*networks, size, self.vehicles, lanes).eval()
 
     @property
     def remembered_lanes(self) -> int:
@@ -159,7 +144,7 @@ def save_monitored(directory: str | os.PathLike[str], calm: Path, wary: Path, me
         (folder / name).mkdir(parents=True, exist_ok=True)
         for file in (WEIGHTS_FILE, CONFIG_FILE):
             shutil.copyfile(agent_folder(source) / file, folder / name / file)
-    write_json(folder / CONFIG_FILE, {"format": FORMAT, "version": VERSION, "metadata": metadata})
+    write_json(folder / CONFIG_FILE, {"format": MONITORED_FORMAT, "version": VERSION, "metadata": metadata})
 
 
 def is_monitored(directory: str | os.PathLike[str]) -> bool:
@@ -168,7 +153,7 @@ def is_monitored(directory: str | os.PathLike[str]) -> bool:
     if not path.is_file():
         return False
     config = read_json(path, "agent")
-    return isinstance(config, dict) and config.get("format") == FORMAT
+    return isinstance(config, dict) and config.get("format") == MONITORED_FORMAT
 
 
 def load_monitored(directory: str | os.PathLike[str], device: str = "cpu") -> MonitoredAgent:

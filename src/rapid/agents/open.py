@@ -58,6 +58,7 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
 
     Before any of them may stand ``shield:BOX:``, which puts the interval filter around it (:mod:`rapid.safety`), with
     a radius such as 0.1 or metres and m/s such as 1m,0.5; before one with Q-values a defence (:mod:`rapid.defences`).
+    ``monitored:CALM,WARY`` is two agents with a monitor between them (:mod:`rapid.monitor`).
 
     `seed` is for drivers that draw; `scenario` tells scripted drivers how many lanes there are; `device` is where a
     saved agent's network goes.
@@ -79,7 +80,7 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
         read_box(box, lanes)
         return shielded(open_agent(inner, scenario, seed, device), box, lanes)
     if spec.startswith(MONITORED):
-        from rapid.agents.monitored import MonitoredAgent, monitored_parts
+        from rapid.agents.monitored import MonitoredAgent
 
         calm, wary = (open_agent(each, scenario, seed, device) for each in monitored_parts(spec))
         return MonitoredAgent(calm, wary, scenario)
@@ -120,6 +121,21 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
     )
 
 
+def monitored_parts(spec: str) -> tuple[str, str]:
+    """Return the specs of the calm and of the wary agent of a spec such as ``monitored:CALM,WARY``.
+
+    Raises:
+        RapidError: it does not name two.
+    """
+    calm, _, wary = spec.removeprefix(MONITORED).rpartition(",")
+    if not calm.strip() or not wary.strip():
+        raise RapidError(
+            f"'{spec}' does not name two agents. Expected monitored:CALM,WARY: who drives while what is seen can be "
+            "true, and who drives once it cannot."
+        )
+    return calm.strip(), wary.strip()
+
+
 def own_scenario(specs: Sequence[str]) -> str:
     """Return the scenario in which the saved agents among `specs` were trained; empty if none of them is saved.
 
@@ -127,7 +143,12 @@ def own_scenario(specs: Sequence[str]) -> str:
         RapidError: they were trained in different ones.
     """
     found: dict[str, str] = {}
-    for spec in specs:
+    left = list(specs)
+    while left:
+        spec = left.pop(0)
+        if spec.startswith(MONITORED):
+            left = [*monitored_parts(spec), *left]
+            continue
         while (shield := spec.startswith(SHIELD)) or is_defence(spec):
             spec = spec[len(SHIELD) :].partition(":")[2] if shield else unwrapped(spec).agent
         path = agent_folder(spec) / "config.json"
@@ -153,6 +174,11 @@ def network_agent(spec: str, device: str = "cpu") -> "QAgent":
         raise RapidError(
             f"'{spec}' is an agent behind a defence without training, which is neither exported nor certified. Give "
             "the agent alone, or with shield:BOX: before it."
+        )
+    if spec.startswith(MONITORED):
+        raise RapidError(
+            f"'{spec}' is two policies with a monitor between them, which is neither exported nor certified. Give one "
+            f"of the two: {' or '.join(monitored_parts(spec))}."
         )
     if spec.startswith(SHIELD):
         box, _, inner = spec[len(SHIELD) :].partition(":")

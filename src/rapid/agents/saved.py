@@ -25,6 +25,8 @@ from rapid.scenarios import ACTIONS, FEATURES
 from rapid.text import printable
 
 FORMAT = "rapid-agent"
+MONITORED_FORMAT = "rapid-monitored-agent"
+"""Of a directory with two agents and a monitor between them (:mod:`rapid.agents.monitored`)."""
 VERSION = 1
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "weights.safetensors"
@@ -144,6 +146,11 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
     """
     folder = agent_folder(directory)
     config = files.read_json(folder / CONFIG_FILE, "agent")
+    if isinstance(config, dict) and config.get("format") == MONITORED_FORMAT:
+        raise RapidError(
+            f"The agent '{directory}' is two policies with a monitor between them, and one is wanted here. Give "
+            f"'{folder / 'calm'}', which drives while nothing that is seen contradicts, or '{folder / 'wary'}'."
+        )
     if not isinstance(config, dict) or config.get("format") != FORMAT:
         raise RapidError(f"'{folder / CONFIG_FILE}' does not describe an agent. Give the directory of a saved agent.")
     if config.get("version") != VERSION:

@@ -180,9 +180,9 @@ def for_gradients(values: Values) -> Generator[None]:
     """Allow gradients by the observations, spare those by the weights, and compute layers fast where that is known."""
     network: Any = values.network if isinstance(values, AtState) else values
     networks = [network] if isinstance(network, nn.Module) else []
-    with torch.inference_mode(False), torch.enable_grad(), no_denormals():
-        with spared_weights(*networks), compiled_layers(*networks):
-            yield
+    fast = spared_weights(*networks), compiled_layers(*networks)
+    with torch.inference_mode(False), torch.enable_grad(), no_denormals(), fast[0], fast[1]:
+        yield
 
 
 @torch.no_grad()

@@ -1,0 +1,197 @@
+"""A monitor between two policies: the calm one is not disturbed, lies are noticed, and clear errors."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rapid.agents.monitored import MonitoredAgent, load_monitored, save_monitored
+from rapid.agents.open import check_road, network_agent, open_agent, own_scenario
+from rapid.agents.saved import CONFIG_FILE, load_agent, moved_on
+from rapid.attacks import get_attack
+from rapid.attacks.attack import values_of
+from rapid.cli import main
+from rapid.errors import RapidError
+from rapid.evaluation.rollouts import run_episodes
+from rapid.monitor import BRAKING, CARS, SENSOR_PLACE, SENSOR_SPEED, contradicts
+from rapid.networks.memory import STATE_SIZE, initial_state
+from rapid.scenarios import PAPER_SCENARIOS, SLOWER
+from rapid.simulator import make_vec
+from rapid.spawns import spawn_seeds
+
+SCENARIO = "lane-3-density-2"
+CALM, WARY = f"shipped:{SCENARIO}/rapid", f"shipped:{SCENARIO}/squeezed"
+SPEC = f"monitored:{CALM},{WARY}"
+SLACK = np.array([0, SENSOR_PLACE, SENSOR_PLACE, SENSOR_SPEED, SENSOR_SPEED], np.float32)
+
+
+@pytest.fixture(scope="module")
+def driven() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of twelve worlds that a policy drives: what is seen, what the car knows, and what was seen before."""
+    agent, met = open_agent(SPEC, SCENARIO), []
+    env = make_vec(SCENARIO, 12, autoreset=False)
+    obs, _ = env.reset(seed=spawn_seeds("tune", 12))
+    state, alive = agent.start(12), np.ones(12, np.bool_)
+    for _ in range(30):
+        parts = agent.network.parts(torch.from_numpy(state))
+        met.append((obs[alive].copy(), parts.own_BS.numpy()[alive], parts.before_BVF.numpy()[alive].copy()))
+        action = agent.act(obs, state)
+        state = moved_on(agent, obs, state, action)
+        obs, _, terminated, truncated, _ = env.step(action)
+        alive &= ~(terminated | truncated)
+        if not alive.any():
+            break
+    return met
+
+
+def doubted(obs: np.ndarray, own: np.ndarray, before: np.ndarray) -> np.ndarray:
+    return contradicts(*map(torch.from_numpy, (obs, own, before)), 3).numpy()
+
+
+@pytest.mark.parametrize("scenario", PAPER_SCENARIOS)
+def test_where_nobody_lies_the_calm_policy_drives_alone(scenario: str):
+    seeds = spawn_seeds("tune", 10)
+    calm, wary = f"shipped:{scenario}/rapid", f"shipped:{scenario}/squeezed"
+    both = run_episodes(open_agent(f"monitored:{calm},{wary}", scenario), scenario, seeds)
+    alone = run_episodes(open_agent(calm, scenario), scenario, seeds)
+    assert [row.episode_return for row in both.rows()] == [row.episode_return for row in alone.rows()]
+
+
+def test_under_noise_the_wary_policy_drives_from_the_first_decision():
+    """The noise moves the ego's own speed, which the car knows, so that every episode is the wary policy's own."""
+    seeds = spawn_seeds("tune", 12)
+    both = run_episodes(open_agent(SPEC, SCENARIO), SCENARIO, seeds, get_attack("uniform"))
+    alone = run_episodes(open_agent(WARY, SCENARIO), SCENARIO, seeds, get_attack("uniform"))
+    same = [a.episode_return == b.episode_return for a, b in zip(both.rows(), alone.rows(), strict=True)]
+    assert np.mean(same) > 0.8
+
+
+@settings(max_examples=60, deadline=None)
+@given(moment=st.integers(0, 29), seed=st.integers(0, 2**32 - 1), size=st.floats(0, 1))
+def test_an_error_of_a_sensor_is_no_contradiction(driven: list, moment: int, seed: int, size: float):
+    obs, own, before = driven[min(moment, len(driven) - 1)]
+    rng = np.random.default_rng(seed)
+    present = obs[..., :1] > 0.5
+    seen = obs + (rng.uniform(-size, size, obs.shape).astype(np.float32) * SLACK) * present
+    present = before[..., :1] > 0.5
+    seen_before = before + (rng.uniform(-size, size, obs.shape).astype(np.float32) * SLACK) * present
+    assert not doubted(seen, own, seen_before).any()
+
+
+@pytest.mark.parametrize(("feature", "moved"), [(1, 40.0), (1, -40.0), (3, 4.0), (3, -5.0), (4, 40.0)])
+def test_a_lie_about_the_ego_is_noticed_at_once(driven: list, feature: int, moved: float):
+    for obs, own, before in driven:
+        seen = obs.copy()
+        seen[:, 0, feature] += moved
+        assert doubted(seen, own, before).all()
+
+
+def test_cars_that_jump_are_noticed_and_one_alone_is_not(driven: list):
+    obs, own, before = driven[5]
+    assert not doubted(obs, own, before).any()
+    near = obs[..., 0] > 0.5
+    jump = BRAKING / 2 + 2 * SENSOR_PLACE + SENSOR_SPEED + 1
+    for cars in range(4):
+        seen = obs.copy()
+        for world in range(len(obs)):
+            rows = np.flatnonzero(near[world])[1 : 1 + cars]
+            # Alone on the road: who is matched with whom is beyond doubt.
+            others = np.setdiff1d(np.arange(1, 15), rows)
+            seen[world, others] = 0
+            seen[world, rows, 1] = before[world, rows, 1] + before[world, rows, 3] - jump
+            seen[world, rows, 2:] = before[world, rows, 2:]
+        assert doubted(seen, own, before).all() == (cars >= CARS)
+        assert doubted(seen, own, before).any() == (cars >= CARS)
+
+
+def test_a_doubt_lasts_until_the_episode_ends_and_rows_go_to_their_policies(driven: list):
+    agent = open_agent(SPEC, SCENARIO)
+    calm, wary = load_agent(CALM), load_agent(WARY)
+    obs, _, _ = driven[0]
+    state, memory = agent.start(len(obs)), wary.start(len(obs))
+    lied = obs.copy()
+    lied[::2, 0, 3] -= 8
+    expected = np.where(np.arange(len(obs))[:, None] % 2 == 0, wary.q_values(lied, memory), calm.q_values(lied))
+    np.testing.assert_allclose(agent.q_values(lied, state), expected, atol=1e-5)
+    action = agent.act(lied, state)
+    state, memory = moved_on(agent, lied, state, action), wary.remember(memory, action)
+    obs = driven[1][0]
+    agreed = agent.doubts(obs, state)
+    assert agreed[::2].all()
+    np.testing.assert_allclose(agent.q_values(obs, state)[::2], wary.q_values(obs, memory)[::2], atol=1e-5)
+    assert not agent.doubts(driven[0][0], agent.start(len(obs))).any()
+
+
+def test_its_memory_is_that_of_the_car():
+    agent = open_agent(SPEC, SCENARIO)
+    state = agent.start(3)
+    np.testing.assert_array_equal(state[:, 1 : 1 + STATE_SIZE], initial_state(3, 3))
+    before = state.copy()
+    moved = agent.remember(state, np.array([SLOWER] * 3))
+    np.testing.assert_array_equal(state, before)  # what is given stays as it is
+    np.testing.assert_array_equal(moved[:, -STATE_SIZE:], moved[:, 1 : 1 + STATE_SIZE])
+
+
+def test_an_attack_differentiates_the_policy_that_drives(driven: list):
+    agent = open_agent(SPEC, SCENARIO)
+    obs, _, _ = driven[0]
+    seen = torch.from_numpy(obs).requires_grad_()
+    values = values_of(agent, agent.start(len(obs)))
+    assert values is not None
+    (gradient,) = torch.autograd.grad(values(seen).max(1).values.sum(), seen)
+    own = torch.from_numpy(obs).requires_grad_()
+    (expected,) = torch.autograd.grad(load_agent(CALM).network(own).max(1).values.sum(), own)
+    torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("attack", ["world:horizon=2,steps=2", "world:horizon=2,steps=2,budget=1", "coupled:steps=2"])
+def test_attacks_that_go_by_the_episode_can_be_made_on_it(attack: str):
+    rows = run_episodes(open_agent(SPEC, SCENARIO), SCENARIO, spawn_seeds("tune", 2), get_attack(attack)).rows()
+    assert len(rows) == 2
+
+
+def test_it_is_saved_with_both_policies_and_drives_as_before(tmp_path: Path):
+    made = {"scenario": SCENARIO, "name": "two of them"}
+    save_monitored(tmp_path / "agent", Path(CALM), Path(WARY), made)
+    agent = open_agent(str(tmp_path / "agent"), SCENARIO)
+    assert isinstance(agent, MonitoredAgent)
+    assert agent.name == "two of them"
+    assert own_scenario([str(tmp_path / "agent")]) == own_scenario([SPEC]) == SCENARIO
+    seeds = spawn_seeds("tune", 4)
+    for attack in ("none", "fgsm"):
+        ours = run_episodes(agent, SCENARIO, seeds, get_attack(attack)).rows()
+        spec = run_episodes(open_agent(SPEC, SCENARIO), SCENARIO, seeds, get_attack(attack)).rows()
+        assert [row.episode_return for row in ours] == [row.episode_return for row in spec]
+
+
+def test_clear_errors_before_anything_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for spec, words in (
+        ("monitored:rapid", "does not name two agents"),
+        ("monitored:,x", "does not name two agents"),
+        (f"monitored:slower,{WARY}", "'slower' has no network"),
+    ):
+        with pytest.raises(RapidError, match=words):
+            open_agent(spec, SCENARIO)
+    with pytest.raises(RapidError, match="neither exported nor certified"):
+        network_agent(SPEC)
+    with pytest.raises(RapidError, match="road of 3 lanes"):
+        check_road(open_agent(SPEC, SCENARIO), PAPER_SCENARIOS[1])
+    with pytest.raises(RapidError, match="lane-4"):
+        own_scenario([f"monitored:{CALM},shipped:{PAPER_SCENARIOS[1]}/squeezed"])
+    folder = tmp_path / "agent"
+    save_monitored(folder, Path(CALM), Path(WARY), {"scenario": SCENARIO})
+    with pytest.raises(RapidError, match="two policies with a monitor"):
+        load_agent(folder)
+    with pytest.raises(SystemExit) as ended:
+        main(["export", str(folder)])
+    assert ended.value.code == 2
+    assert "one is wanted here" in capsys.readouterr().err
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    for changes, words in (({"version": 9}, "format version 9"), ({"metadata": {}}, "does not tell its scenario")):
+        (folder / CONFIG_FILE).write_text(json.dumps(config | changes))
+        with pytest.raises(RapidError, match=words):
+            load_monitored(folder)
