@@ -96,10 +96,28 @@ class Driver:
 
 
 @dataclass(frozen=True)
+class Monitored:
+    """Two agents with a monitor between them, which drive in a scenario (:mod:`rapid.monitor`).
+
+    The one drives while what is seen can be true: a shipped agent, as a `Driver`, or one trained here; the other once
+    it cannot.
+    """
+
+    calm: "Distill | Adapt | Driver"
+    wary: Adapt
+    scenario: str
+
+    @property
+    def seed(self) -> int:
+        """The training seed of the wary one."""
+        return self.wary.seed
+
+
+@dataclass(frozen=True)
 class Drive:
     """Episodes of an agent over the first spawns of a set, under an attack."""
 
-    agent: "Distill | Adapt | Driver"
+    agent: "Driven"
     scenario: str
     attack: str
     spawns: int
@@ -121,15 +139,18 @@ class Scenes:
 class Decide:
     """Seconds per decision of an agent or a teacher on the machine where it is measured."""
 
-    agent: "Distill | Adapt | Driver"
+    agent: "Driven"
     scenario: str
     decisions: int
 
 
 Data = Shipped | Collect | Relabel
-Agent = Distill | Adapt | Fresh
-Cell = Shipped | Collect | Relabel | Mix | Fresh | Distill | Adapt | Drive | Scenes | Decide
-Kind = Literal["shipped", "collect", "relabel", "mix", "fresh", "distill", "adapt", "drive", "scenes", "decide"]
+Agent = Distill | Adapt | Monitored | Fresh
+Driven = Distill | Adapt | Monitored | Driver
+Cell = Shipped | Collect | Relabel | Mix | Fresh | Distill | Adapt | Monitored | Drive | Scenes | Decide
+Kind = Literal[
+    "shipped", "collect", "relabel", "mix", "fresh", "distill", "adapt", "monitored", "drive", "scenes", "decide"
+]
 
 EPOCH: dict[str, int] = {
     "collect": 1,
@@ -138,6 +159,7 @@ EPOCH: dict[str, int] = {
     "fresh": 1,
     "distill": 1,
     "adapt": 1,
+    "monitored": 1,
     "drive": 1,
     "scenes": 1,
     "decide": 1,
@@ -190,6 +212,8 @@ def title(cell: Cell) -> str:
             return f"distill, {cell.network.kind}, {data_scenario(cell.data)}, seed {cell.seed}"
         case Adapt():
             return f"adapt, {cell.scenario}, seed {cell.seed}"
+        case Monitored():
+            return f"monitored, {cell.scenario}, seed {cell.seed}"
         case Drive():
             who = cell.agent.name if isinstance(cell.agent, Driver) else f"seed {cell.agent.seed}"
             return f"drive, {cell.scenario}, {cell.attack}, {who}"

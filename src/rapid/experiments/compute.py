@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 import rapid
+from rapid.agents.monitored import save_monitored
 from rapid.agents.open import open_agent
-from rapid.agents.saved import load_agent, remembers
+from rapid.agents.saved import load_agent, moved_on, remembers
 from rapid.config import Config
 from rapid.config_learning import NetworkConfig
 from rapid.data.dataset import load_dataset, mix, save_dataset
@@ -28,9 +29,11 @@ from rapid.experiments.cells import (
     Decide,
     Distill,
     Drive,
+    Driven,
     Driver,
     Fresh,
     Mix,
+    Monitored,
     Relabel,
     Scenes,
     Shipped,
@@ -79,9 +82,10 @@ def compute(cell: Cell, place: Path, given: Mapping[str, Path]) -> None:
             distill_agent(_settings(cell), given[key(cell.data)] / "data", place)
         case Adapt():
             data = given[key(cell.data)] / "data" if cell.data else None
-            # The name of a shipped agent is read like a directory.
-            origin = Path(cell.origin.name) if isinstance(cell.origin, Driver) else given[key(cell.origin)] / "agent"
-            adapt_agent(_settings(cell), origin, data, place)
+            adapt_agent(_settings(cell), _folder(cell.origin, given), data, place)
+        case Monitored():
+            metadata = {"name": "monitored", "scenario": cell.scenario, "seed": cell.seed}
+            save_monitored(place / "agent", _folder(cell.calm, given), _folder(cell.wary, given), metadata)
         case Drive():
             _drive(cell, place, given)
         case Scenes():
@@ -124,9 +128,14 @@ def _collect(cell: Collect, place: Path) -> None:
         raise RapidError(f"Only {len(dataset)} of {cell.transitions} transitions were collected. Run it again.")
 
 
-def _agent(agent: Distill | Adapt | Driver, scenario: str, given: Mapping[str, Path], seed: int) -> Any:
+def _folder(agent: Distill | Adapt | Monitored | Fresh | Driver, given: Mapping[str, Path]) -> Path:
+    # The name of a shipped agent is read like a directory.
+    return Path(agent.name) if isinstance(agent, Driver) else given[key(agent)] / "agent"
+
+
+def _agent(agent: Driven, scenario: str, given: Mapping[str, Path], seed: int) -> Any:
     if not isinstance(agent, Driver):
-        return load_agent(given[key(agent)] / "agent")
+        return open_agent(str(_folder(agent, given)), scenario, seed)
     if agent.teacher is not None:
         return make_teacher(agent.teacher, get_scenario(scenario).lanes, seed)
     return open_agent(agent.name, scenario, seed)
@@ -197,7 +206,7 @@ def _decide(cell: Decide, place: Path, given: Mapping[str, Path]) -> None:
             action, previous = int(decision.action), decision
         else:
             action_B = agent.act(np.asarray(obs_VF)[None], *known)
-            known = tuple(agent.remember(state_BS, action_B) for state_BS in known)
+            known = tuple(moved_on(agent, np.asarray(obs_VF)[None], state_BS, action_B) for state_BS in known)
             action = int(action_B[0])
         seconds.append(time.perf_counter() - start)
         obs_VF, _, terminated, truncated, _ = env.step(action)
@@ -257,8 +266,9 @@ def _root(agent: Distill | Adapt | Fresh | Driver) -> Distill | Fresh | Driver:
     return agent
 
 
-def _network(agent: Distill | Adapt | Fresh | Driver) -> NetworkConfig:
-    """Return the settings of the network that an agent began with."""
+def _network(agent: Distill | Adapt | Monitored | Fresh | Driver) -> NetworkConfig:
+    """Return the settings of the network that an agent began with; of two with a monitor the wary one's."""
+    agent = agent.wary if isinstance(agent, Monitored) else agent
     root = _root(agent)
     return _of_shipped(root.name) if isinstance(root, Driver) else root.network
 

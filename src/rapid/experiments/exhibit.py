@@ -8,7 +8,7 @@ from rapid.attacks.spec import NAMED
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import learned as make
 from rapid.experiments import words
-from rapid.experiments.cells import Adapt, Cell, Distill, Drive, Driver
+from rapid.experiments.cells import Cell, Drive, Driven, Driver
 from rapid.experiments.figures import Lines, Router
 from rapid.experiments.learned import Setting
 from rapid.experiments.methods import METHODS, Method
@@ -64,7 +64,7 @@ class Exhibit:
     of_paper: bool = True
 
 
-def drives(request: Request, agent: Distill | Adapt | Driver, scenario: str, attacks: Sequence[str]) -> list[Drive]:
+def drives(request: Request, agent: Driven, scenario: str, attacks: Sequence[str]) -> list[Drive]:
     """Return an agent's episodes under several attacks."""
     effort = make.EFFORTS[request.scale]
     slow = isinstance(agent, Driver) and (agent.teacher is not None or agent.name.startswith("planner"))

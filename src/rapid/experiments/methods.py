@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from rapid.experiments.cells import Adapt, Distill, Driver
+from rapid.experiments.cells import Driven, Driver
 from rapid.experiments.learned import (
     Setting,
     adapted,
@@ -31,7 +31,7 @@ class Method:
     id: str
     label: str
     kind: Literal["floor", "teacher", "planner", "learned"]
-    agent: Callable[[Setting], Distill | Adapt | Driver]
+    agent: Callable[[Setting], Driven]
     printed: str = ""
     """What the paper's tables call it."""
     looks: Literal["everything", "presence", "nothing"] = "everything"

@@ -4,7 +4,7 @@ from typing import Literal
 
 from rapid.config import MixConfig, TeacherConfig
 from rapid.experiments import learned as make
-from rapid.experiments.cells import Adapt, Cell, Collect, Distill, Drive, Driver, Mix, Scenes
+from rapid.experiments.cells import Adapt, Cell, Collect, Distill, Drive, Driven, Driver, Mix, Scenes
 from rapid.experiments.exhibit import Exhibit, Request, Shown, driven, drives, method_drives, rows_of
 from rapid.experiments.figures import Curve, Lines, Router
 from rapid.experiments.learned import OFFLINE_ITERATIONS, Reading, mixture
@@ -20,7 +20,7 @@ NOISE = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 RATIOS = (0.0, 0.125, 0.25, 0.5, 0.75, 1.0)
 
 
-def _noise(request: Request, agent: Distill | Adapt | Driver, kind: str, size: float) -> list[Drive]:
+def _noise(request: Request, agent: Driven, kind: str, size: float) -> list[Drive]:
     attack = f"{kind}:radius={size:g}" if size else "none"
     spawns = make.EFFORTS[request.scale].reference_spawns
     seed = 0 if isinstance(agent, Driver) else agent.seed
@@ -28,7 +28,7 @@ def _noise(request: Request, agent: Distill | Adapt | Driver, kind: str, size: f
     return [Drive(agent, PAPER_SCENARIOS[0], attack + presence, spawns, seed=seed)]
 
 
-def _attacked(request: Request) -> dict[str, list[Distill | Adapt | Driver]]:
+def _attacked(request: Request) -> dict[str, list[Driven]]:
     settings = [request.setting(PAPER_SCENARIOS[0], seed) for seed in request.seeds]
     return {
         "teacher": [make.the_teacher(request.scale)],
