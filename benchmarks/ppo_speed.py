@@ -92,8 +92,10 @@ def compete(plan: str, attack_steps: int, scenario: str, threads: int, attention
     liar = replace(adapt.adversary, steps=attack_steps) if attack_steps else adapt.adversary
     network = q_network.build_network(config.network, seen.lanes, 0)
     if adapt.memory:
-        # Earlier programs squeeze nothing.
-        network = q_network.with_memory(network, *([True] if getattr(adapt, "squeeze", False) else []))
+        # Earlier programs squeeze nothing, and have this beside the network.
+        place = "conversions" if importlib.util.find_spec("rapid.networks.conversions") else "q_network"
+        with_memory = importlib.import_module(f"rapid.networks.{place}").with_memory
+        network = with_memory(network, *([True] if getattr(adapt, "squeeze", False) else []))
     gate = network.gate
     assert gate is not None
     torch.nn.init.constant_(gate, GATE)

@@ -15,7 +15,7 @@ from rapid.data.fallbacks import fallback_notice
 from rapid.data.shipped import SHIPPED
 from rapid.errors import RapidError, did_you_mean
 from rapid.locks import exclusive
-from rapid.networks.q_network import check_widening
+from rapid.networks.conversions import check_widening
 from rapid.outputs import RUN, clear
 from rapid.phases.adapt import ONLINE, adapt_agent, learn_online
 from rapid.phases.checks import check

@@ -12,8 +12,9 @@ from rapid.errors import RapidError
 from rapid.evaluation import rollouts
 from rapid.evaluation.recording import explained_by
 from rapid.evaluation.rollouts import run_episodes
+from rapid.networks.conversions import with_memory
 from rapid.networks.memory import STEPS, initial_state, next_state
-from rapid.networks.q_network import build_network, with_memory
+from rapid.networks.q_network import build_network
 from rapid.scenarios import FASTER, SLOWER
 from rapid.simulator import make_vec
 

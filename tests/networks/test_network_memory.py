@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from rapid.agents.saved import QAgent, load_agent, remembers, save_agent
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
+from rapid.networks.conversions import with_memory
 from rapid.networks.encoding import feature_scale
 from rapid.networks.memory import (
     DISTANCE,
@@ -18,7 +19,7 @@ from rapid.networks.memory import (
     initial_state,
     next_state,
 )
-from rapid.networks.q_network import build_network, with_memory
+from rapid.networks.q_network import build_network
 from rapid.scenarios import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from rapid.simulator import make_vec
 

@@ -7,8 +7,9 @@ import torch
 
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
+from rapid.networks.conversions import widened
 from rapid.networks.mlp import MlpHead
-from rapid.networks.q_network import TokenHead, build_network, set_phase, widened
+from rapid.networks.q_network import TokenHead, build_network, set_phase
 
 SMALL = {"width": 16, "heads": 2, "feedforward": 32, "hidden": (24, 24)}
 KINDS = ("rapid", "attentive", "mlp", "mlp-mixture")

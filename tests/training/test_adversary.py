@@ -14,9 +14,10 @@ from rapid.agents.saved import load_agent, remembers, save_agent
 from rapid.config import AdversaryConfig, Config
 from rapid.config_io import validate
 from rapid.errors import RapidError
+from rapid.networks.conversions import with_memory
 from rapid.networks.encoding import feature_scale
 from rapid.networks.memory import RIGHTMOST, initial_state, next_state
-from rapid.networks.q_network import set_phase, with_memory
+from rapid.networks.q_network import set_phase
 from rapid.phases.adapt import adapt_agent
 from rapid.presets import preset
 from rapid.seeding import numpy_stream

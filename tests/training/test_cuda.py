@@ -11,7 +11,8 @@ from rapid.config import Config, LossConfig, OptimizerConfig
 from rapid.data.batch import with_rows
 from rapid.data.dataset import load_dataset, mix
 from rapid.data.replay import OfflineSampler
-from rapid.networks.q_network import build_network, set_phase, widened
+from rapid.networks.conversions import widened
+from rapid.networks.q_network import build_network, set_phase
 from rapid.presets import preset
 from rapid.training import offline
 from rapid.training.learner import Learner

@@ -16,8 +16,9 @@ from rapid.agents.saved import save_agent
 from rapid.config import AdaptConfig, Config, NetworkConfig
 from rapid.config_io import least_steps, validate
 from rapid.errors import RapidError
+from rapid.networks.conversions import with_memory
 from rapid.networks.memory import STEPS, initial_state
-from rapid.networks.q_network import QNetwork, build_network, with_memory
+from rapid.networks.q_network import QNetwork, build_network
 from rapid.phases.adapt import adapt_agent
 from rapid.phases.checks import check, shown_plan
 from rapid.presets import preset

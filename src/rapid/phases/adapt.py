@@ -12,7 +12,8 @@ from rapid.config_io import parts_of, to_dict
 from rapid.config_learning import NetworkConfig
 from rapid.data.dataset import load_dataset
 from rapid.errors import RapidError
-from rapid.networks.q_network import build_network, check_memory, for_lanes, widened, with_memory
+from rapid.networks.conversions import for_lanes, widened, with_memory
+from rapid.networks.q_network import build_network, check_memory
 from rapid.phases.checks import shown_plan
 from rapid.phases.data import learnable
 from rapid.phases.measure import learning_curve
