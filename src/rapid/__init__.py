@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rapid.registration import register_when_imported
 
 if TYPE_CHECKING:
-    from rapid.agents.saved import load_agent as load_agent
+    from rapid.agents.monitored import load_agent as load_agent
     from rapid.data.dataset import load_dataset as load_dataset
     from rapid.play.inline import watch as watch
     from rapid.simulator import make_env as make_env
@@ -20,7 +20,7 @@ __version__ = "0.2.0"
 __all__ = ["__version__", "load_agent", "load_dataset", "make_env", "make_sb3_vec", "make_vec", "watch"]
 
 _HOME = {
-    "load_agent": "rapid.agents.saved",
+    "load_agent": "rapid.agents.monitored",
     "load_dataset": "rapid.data.dataset",
     "make_env": "rapid.simulator",
     "make_sb3_vec": "rapid.simulator",

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rapid.agents import saved
 from rapid.agents.open import MONITORED
-from rapid.agents.q_agent import check_observations
-from rapid.agents.saved import CONFIG_FILE, MONITORED_FORMAT, WEIGHTS_FILE, load_agent, noticed, remembers
+from rapid.agents.q_agent import QAgent, check_observations
+from rapid.agents.saved import CONFIG_FILE, MONITORED_FORMAT, WEIGHTS_FILE, noticed, remembers
 from rapid.agents.shipped import agent_folder
 from rapid.agents.watchable import Watchable
 from rapid.attacks.attack import network_of
@@ -138,7 +139,7 @@ def save_monitored(directory: str | os.PathLike[str], calm: Path, wary: Path, me
     Raises:
         RapidError: one of them cannot be read or does not fit the other, or the directory cannot be written.
     """
-    MonitoredAgent(load_agent(calm), load_agent(wary), metadata["scenario"])
+    MonitoredAgent(saved.load_agent(calm), saved.load_agent(wary), metadata["scenario"])
     folder = Path(directory)
     for name, source in ((CALM, calm), (WARY, wary)):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -173,5 +174,18 @@ def load_monitored(directory: str | os.PathLike[str], device: str = "cpu") -> Mo
     if not isinstance(metadata, dict) or not isinstance(metadata.get("scenario"), str):
         raise RapidError(f"The agent '{folder}' is damaged: {CONFIG_FILE} does not tell its scenario. Save it again.")
     metadata["name"] = printable(str(metadata.get("name") or folder.resolve().name))
-    calm, wary = (load_agent(folder / name, device) for name in (CALM, WARY))
+    calm, wary = (saved.load_agent(folder / name, device) for name in (CALM, WARY))
     return MonitoredAgent(calm, wary, metadata["scenario"], metadata)
+
+
+def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent | MonitoredAgent:
+    """Read a saved agent, or one that is shipped (``shipped:lane-3-density-2/rapid``): one policy, or two of them.
+
+    Args:
+        directory: what :func:`rapid.agents.saved.save_agent` or :func:`save_monitored` wrote, or the shipped name.
+        device: where its network goes.
+
+    Raises:
+        RapidError: there is no agent, or it is damaged, of another version, or does not fit this program.
+    """
+    return load_monitored(directory, device) if is_monitored(directory) else saved.load_agent(directory, device)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rapid
-from rapid.agents.saved import moved_on, remembers
+from rapid.agents.saved import load_agent, moved_on, remembers
 from rapid.agents.shipped import agent_folder, is_shipped
 from rapid.defences import is_defence, unwrapped
 from rapid.errors import RapidError, did_you_mean
@@ -99,10 +99,6 @@ def open_agent(spec: str, scenario: str, seed: int = 0, device: str = "cpu") -> 
             return PlannerAgent()
         return CarsPlanner(seed=seed) if spec == "planner-cars" else ObservationPlanner(scenario, seed=seed)
     if is_shipped(spec) or Path(spec).is_dir():
-        from rapid.agents.monitored import is_monitored, load_monitored
-
-        if is_monitored(spec):
-            return load_monitored(spec, device)
         agent = rapid.load_agent(spec, device)
         if agent.metadata.get("adversary_of"):
             raise RapidError(
@@ -184,7 +180,7 @@ def network_agent(spec: str, device: str = "cpu") -> "QAgent":
         box, _, inner = spec[len(SHIELD) :].partition(":")
         agent = network_agent(inner, device)
         return shielded(agent, box, agent.network.lanes)
-    return rapid.load_agent(spec, device)
+    return load_agent(spec, device)
 
 
 def check_road(agent: Any, scenario: str) -> None:
