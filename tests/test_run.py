@@ -137,7 +137,7 @@ def test_online_baselines_drive_as_much_as_phase_3_and_know_nothing_at_first(con
     assert "online PPO" in (finished / "report.html").read_text()
 
 
-@pytest.mark.parametrize("plan", ["bold", "ppo", "robust", "guided", "squeezed"])
+@pytest.mark.parametrize("plan", ["bold", "ppo", "robust", "guided", "squeezed", "wary"])
 def test_online_baselines_of_every_plan_can_be_trained(plan: str):
     for change in ({}, {"vehicles": 31}, {"mirror": True, "memory": False}):
         config = preset("strong", "tiny", plan)

@@ -34,7 +34,7 @@ from rapid.config_learning import RobustConfig as RobustConfig
 
 Recipe = Literal["paper", "strong"]
 Scale = Literal["tiny", "quick", "full"]
-Plan = Literal["printed", "careful", "bold", "ppo", "robust", "guided", "squeezed"]
+Plan = Literal["printed", "careful", "bold", "ppo", "robust", "guided", "squeezed", "wary"]
 RECIPES: tuple[str, ...] = typing.get_args(Recipe)
 SCALES: tuple[str, ...] = typing.get_args(Scale)
 PLANS: tuple[str, ...] = typing.get_args(Plan)
@@ -175,7 +175,8 @@ class Config:
     plan: Plan = "bold"
     """How phase 3 learns: `printed` as the paper does; `careful` close to the data; `bold` by much exploring; `ppo` so
     for longer, and then by PPO; `robust` by PPO under attack, with a memory; `guided` as `ppo`, and is then shown under
-    attack what to do; `squeezed` as `ppo`, later under attack, by features that an attack cannot bend far."""
+    attack what to do; `squeezed` as `ppo`, later under attack, by features that an attack cannot bend far; `wary` by
+    PPO with such features, under attack from the first step: it is for the second policy of a monitored agent."""
     scenario: str = "lane-3-density-2"
     """Where the data is collected and policies are trained and measured."""
     simulator: Literal["compiled", "highway-env"] = "compiled"

@@ -1,13 +1,13 @@
 """A monitor over two policies: one drives while what is seen can be true, the other once it cannot.
 
 A car knows its speed and place from its own actions (:mod:`rapid.networks.memory`), and other cars move no faster than
-cars can. While what is seen agrees with both, to within what a sensor errs by, the *calm* policy drives; from the first
-contradiction to the end of the episode the *wary* one does, which was trained under attack. It is the Simplex
-architecture (Sha, 2001: "Using simplicity to control complexity"): a rule decides between a controller that performs
-and one that endures.
+cars can. While what is seen agrees with both, the *calm* policy drives; from the first contradiction to the end of the
+episode the *wary* one does, which was trained under attack. It is the Simplex architecture (Sha, 2001: "Using
+simplicity to control complexity"): a rule decides between a controller that performs and one that endures.
 
 The rule itself is not differentiated: an attack that follows gradients sees the policy that drives. Nothing here is a
-guarantee: a lie that contradicts neither the car's memory nor the way cars move is not noticed.
+guarantee: a lie that contradicts neither the car's memory nor the way cars move is not noticed. And it is for exact
+sensors, as a simulator's are: one that errs by more than this is taken for a lie, and the wary policy drives.
 
 Shapes: B batch, V vehicles, F features, A actions, S entries of a state, R some rows of a batch.
 """
@@ -18,13 +18,16 @@ import torch
 from torch import Tensor, nn
 
 from rapid.defences import matched
-from rapid.networks.memory import STATE_SIZE, ego_bounds
+from rapid.networks.memory import SPEED, STATE_SIZE, ego_bounds
 from rapid.scenarios import NUM_FEATURES
 
-SENSOR_PLACE, SENSOR_SPEED = 1.0, 0.5
-"""Metres and m/s by which what is seen may be wrong without a contradiction: what a good sensor may err by."""
-BRAKING, SPEEDING = 13.0, 4.5
-"""m/s that another car can lose and gain within a second. So hard do drivers brake where episodes begin too dense."""
+SPEED_ERROR = 0.05
+"""m/s by which the ego's speed may be seen wrong: what it knows of its own is exact but for rounding."""
+PLACE_ERROR = 2.0
+"""Metres by which its place may lie outside of what is known of it, which is not known exactly."""
+BEHIND, BEYOND = (9.0, 14.0), (4.75, 5.5)
+"""How much less and more than was expected a second before another car's place [m] and speed [m/s] along the road may
+be. So hard do drivers brake where episodes begin too dense."""
 CARS = 2
 """Cars that must be where none could be; one alone may be another that has come into view beside it."""
 
@@ -98,10 +101,10 @@ def contradicts(obs_BVF: Tensor, own_BS: Tensor, before_BVF: Tensor, lanes: int)
     were seen before are where, or as fast as, no car could be now.
     """
     lowest_B4, highest_B4 = ego_bounds(own_BS, lanes)
-    # The bounds of the place are themselves known no better than a sensor is.
-    slack_4 = obs_BVF.new_tensor([2 * SENSOR_PLACE, 2 * SENSOR_PLACE, SENSOR_SPEED, SENSOR_SPEED])
-    ego_B4 = obs_BVF[:, 0, 1:]
-    ego_B = ((ego_B4 < lowest_B4 - slack_4) | (ego_B4 > highest_B4 + slack_4)).any(1)
+    ego_BF = obs_BVF[:, 0]
+    x_B, least_B, most_B = ego_BF[:, 1], lowest_B4[:, 0] - PLACE_ERROR, highest_B4[:, 0] + PLACE_ERROR
+    wrong_speed_B = (torch.hypot(ego_BF[:, 3], ego_BF[:, 4]) - own_BS[:, SPEED]).abs() > SPEED_ERROR
+    ego_B = wrong_speed_B | (x_B < least_B) | (x_B > most_B)
 
     moved_BV2 = before_BVF[..., 1:3] + before_BVF[..., 3:5]
     expected_BVF = torch.cat([before_BVF[..., :1], moved_BV2, before_BVF[..., 3:]], -1)
@@ -109,10 +112,7 @@ def contradicts(obs_BVF: Tensor, own_BS: Tensor, before_BVF: Tensor, lanes: int)
     known_BV[:, 0] = False
     away_BVF = obs_BVF - expected_BVF.gather(1, row_BV[..., None].expand_as(expected_BVF))
     along_BV, faster_BV = away_BVF[..., 1], away_BVF[..., 3]
-    # What was seen before may have been wrong by as much, and the place expected by the wrong speed besides.
-    place, speed = 2 * SENSOR_PLACE + SENSOR_SPEED, 2 * SENSOR_SPEED
-    far_BV = (along_BV < -BRAKING / 2 - place) | (along_BV > SPEEDING / 2 + place)
-    far_BV |= (faster_BV < -BRAKING - speed) | (faster_BV > SPEEDING + speed)
+    far_BV = (along_BV < -BEHIND[0]) | (along_BV > BEYOND[0]) | (faster_BV < -BEHIND[1]) | (faster_BV > BEYOND[1])
     return ego_B | ((known_BV & far_BV).sum(1) >= CARS)
 
 

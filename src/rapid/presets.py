@@ -77,12 +77,13 @@ STEPS: dict[Plan, dict[Scale, tuple[int, int]]] = {
     "robust": {"tiny": (0, 7_680), "quick": (0, 153_600), "full": (0, 600_000)},
     "guided": {"tiny": (200, 15_360), "quick": (30_000, 153_600), "full": (300_000, 921_600)},
     "squeezed": {"tiny": (200, 15_360), "quick": (30_000, 153_600), "full": (300_000, 1_300_000)},
+    "wary": {"tiny": (0, 30_720), "quick": (0, 307_200), "full": (0, 800_000)},
 }
 """Environment steps of phase 3, by Q-learning and then by PPO."""
 DEFAULT_PLAN: dict[Recipe, Plan] = {"paper": "printed", "strong": "bold"}
 OF_RECIPE: dict[Recipe, tuple[Plan, ...]] = {
     "paper": ("printed",),
-    "strong": ("careful", "bold", "ppo", "robust", "guided", "squeezed"),
+    "strong": ("careful", "bold", "ppo", "robust", "guided", "squeezed", "wary"),
 }
 
 
@@ -175,7 +176,9 @@ def _resized(config: Config) -> Config:
     if sizes.iterations:
         distill = replace(distill, iterations=sizes.iterations)
     tiny = config.scale == "tiny"
-    ppo = replace(adapt.ppo, steps=ppo_steps, critic_steps=3_840 if tiny else adapt.ppo.critic_steps)
+    ppo = replace(adapt.ppo, steps=ppo_steps)
+    if tiny:
+        ppo = replace(ppo, critic_steps=3_840, num_envs=min(ppo.num_envs, 128), batch_size=min(ppo.batch_size, 512))
     return replace(
         config,
         collect=collect,
@@ -290,6 +293,25 @@ def _squeezed(adapt: AdaptConfig) -> AdaptConfig:
     )
 
 
+def _wary(adapt: AdaptConfig) -> AdaptConfig:
+    """Return phase 3 by PPO with squeezed features, all of it under attack: for who drives once something is wrong.
+
+    It begins with the plan of `blind`, which it is shown: by trying alone, it would brake for good. What is better than
+    a plan is found by large batches; small ones lose the plan first (docs/log/robustness.md).
+    """
+    calm = _far_sighted(adapt)
+    return replace(
+        calm,
+        train="all",
+        memory=True,
+        squeeze=True,
+        ppo=replace(
+            calm.ppo, num_envs=512, batch_size=2_048, learning_rate=3e-4, largest_kl=0.03, critic_steps=100_000
+        ),
+        adversary=replace(calm.adversary, gradient_share=0.6, noise_share=0.25, guided=0.13),
+    )
+
+
 _PLANS: dict[Plan, Callable[[AdaptConfig], AdaptConfig]] = {
     "printed": _as_it_is,
     "careful": _as_it_is,
@@ -298,4 +320,5 @@ _PLANS: dict[Plan, Callable[[AdaptConfig], AdaptConfig]] = {
     "robust": _under_attack,
     "guided": _guided,
     "squeezed": _squeezed,
+    "wary": _wary,
 }

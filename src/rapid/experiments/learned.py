@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from rapid.agents.shipped import shipped_agents
 from rapid.baselines import OnlineBaseline, offline_baseline, online_baseline
 from rapid.config import AdaptConfig, Config, MixConfig, TeacherConfig
-from rapid.experiments.cells import Adapt, Data, Distill, Driver, Fresh, Mix, Relabel, Shipped
+from rapid.experiments.cells import Adapt, Data, Distill, Driver, Fresh, Mix, Monitored, Relabel, Shipped
 from rapid.presets import preset
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
@@ -178,6 +178,19 @@ def squeezed(setting: Setting) -> Adapt:
     settings = setting.config(plan="squeezed").adapt
     settings = replace(settings, adversary=replace(settings.adversary, begin=0.35, ramp=0.15))
     return _from_trained(setting, settings, SQUEEZED_STEPS, settings.ppo.critic_steps)
+
+
+def wary(setting: Setting) -> Adapt:
+    """Return the policy that drives once something is wrong, which goes on from that of the plan `ppo`."""
+    settings = setting.config(plan="wary").adapt
+    return _from_trained(setting, settings, settings.ppo.steps, settings.ppo.critic_steps)
+
+
+def monitored(setting: Setting) -> Monitored:
+    """Return RAPID after its phase 3 by the plan `ppo`, which gives way to the wary one once something is wrong."""
+    second = wary(setting)
+    assert isinstance(second.origin, Driver | Adapt)
+    return Monitored(second.origin, second, setting.scenario)
 
 
 def _from_trained(setting: Setting, settings: AdaptConfig, steps: int, critic_steps: int) -> Adapt:

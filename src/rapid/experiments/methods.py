@@ -14,12 +14,14 @@ from rapid.experiments.learned import (
     mixture_of_actions,
     mlp,
     mlp_by_ppo,
+    monitored,
     on_rule_data,
     paper_data,
     rapid,
     robust,
     squeezed,
     the_teacher,
+    wary,
     without,
 )
 
@@ -108,6 +110,8 @@ METHODS: dict[str, Method] = {
         ),
         Method("rapid-guided", "RAPID, guided under attack", "learned", guided),
         Method("rapid-squeezed", "RAPID, squeezed features, under attack", "learned", squeezed),
+        Method("rapid-wary", "RAPID, wary", "learned", wary),
+        Method("rapid-monitored", "RAPID, monitored", "learned", monitored),
         Method("mlp-ppo", "MLP, 300K + 700K PPO", "learned", mlp_by_ppo),
         Method("online-ddqn-10k", "online DDQN, 10K", "learned", lambda s: from_scratch(s, "ddqn", "careful")),
         Method(
