@@ -77,7 +77,7 @@ STEPS: dict[Plan, dict[Scale, tuple[int, int]]] = {
     "robust": {"tiny": (0, 7_680), "quick": (0, 153_600), "full": (0, 600_000)},
     "guided": {"tiny": (200, 15_360), "quick": (30_000, 153_600), "full": (300_000, 921_600)},
     "squeezed": {"tiny": (200, 15_360), "quick": (30_000, 153_600), "full": (300_000, 1_300_000)},
-    "wary": {"tiny": (0, 30_720), "quick": (0, 307_200), "full": (0, 800_000)},
+    "wary": {"tiny": (0, 30_720), "quick": (0, 307_200), "full": (0, 500_000)},
 }
 """Environment steps of phase 3, by Q-learning and then by PPO."""
 DEFAULT_PLAN: dict[Recipe, Plan] = {"paper": "printed", "strong": "bold"}
@@ -306,7 +306,7 @@ def _wary(adapt: AdaptConfig) -> AdaptConfig:
         memory=True,
         squeeze=True,
         ppo=replace(
-            calm.ppo, num_envs=512, batch_size=2_048, learning_rate=3e-4, largest_kl=0.03, critic_steps=100_000
+            calm.ppo, num_envs=512, batch_size=2_048, learning_rate=3e-4, largest_kl=0.03, critic_steps=50_000
         ),
         adversary=replace(calm.adversary, gradient_share=0.6, noise_share=0.25, guided=0.13),
     )
