@@ -190,15 +190,16 @@ def test_a_second_derivative_is_refused():
 
 
 def test_it_is_only_asked_for_what_it_is_made_for():
-    rows = torch.zeros(32, 64)
-    assert layer.can_compute(rows, 16, 2, 128)
-    assert not layer.can_compute(rows, 17, 2, 128)
-    assert not layer.can_compute(rows, 16, 8, 128)
-    assert not layer.can_compute(rows, 16, 2, 100)
-    assert not layer.can_compute(rows.double(), 16, 2, 128)
-    assert not layer.can_compute(rows.to("meta"), 16, 2, 128)
+    rows, weight = torch.zeros(32, 64), torch.zeros(128, 64)
+    assert layer.can_compute(rows, 16, 2, weight)
+    assert not layer.can_compute(rows, 16, 2, weight.double())
+    assert not layer.can_compute(rows, 17, 2, weight)
+    assert not layer.can_compute(rows, 16, 8, weight)
+    assert not layer.can_compute(rows, 16, 2, weight[:100])
+    assert not layer.can_compute(rows.double(), 16, 2, weight)
+    assert not layer.can_compute(rows.to("meta"), 16, 2, weight)
     seen: list[bool] = []
-    torch.vmap(lambda rows: seen.append(layer.can_compute(rows, 16, 2, 128)) or rows)(rows[None])
+    torch.vmap(lambda rows: seen.append(layer.can_compute(rows, 16, 2, weight)) or rows)(rows[None])
     assert seen == [False]
 
 

@@ -10,6 +10,7 @@ from rapid.config import DistillConfig, LossConfig, NetworkConfig, OptimizerConf
 from rapid.data.replay import OfflineSampler
 from rapid.data.transitions import RANDOM, Transitions, concatenate, empty
 from rapid.errors import RapidError
+from rapid.networks import layer
 from rapid.networks.q_network import QNetwork, build_network
 from rapid.training import distill, offline
 from rapid.training.learner import Learner
@@ -50,6 +51,24 @@ def test_training_twice_is_bit_equal(tmp_path, kind, algorithm):
     assert lines(tmp_path / "1") == lines(tmp_path / "2")
     other = distill(DATA, network(kind), config, tmp_path / "3", seed=4)
     assert weights(other) != weights(first)
+
+
+def test_layers_are_compiled_in_a_step_and_the_inner_attack_takes_no_gradient_by_weights(monkeypatch):
+    """Of a step with five steps of an inner attack only the loss itself is differentiated by the weights."""
+    learned: list[bool] = []
+    original = layer._backward
+    monkeypatch.setattr(layer, "_backward", lambda *args: learned.append(bool(args[-1])) or original(*args))
+    small = replace(SMALL, width=16, heads=1, feedforward=16)
+    learner = Learner(
+        build_network(small, 3, 0), CONFIG.optimizer, replace(LOSS, robust=RobustConfig(steps=5)), 1, torch.Generator()
+    )
+    sampler = OfflineSampler(DATA, LOSS.discount, 1, "cpu", None)
+    learner.update(sampler.sample(8, np.random.default_rng(0)))
+    layers = small.layers + small.decoder_layers
+    assert learned.count(False) == 5 * layers
+    assert layers <= learned.count(True) <= 2 * layers
+    assert not any(getattr(module, "compiled", False) for module in learner.network.modules())
+    assert all(parameter.requires_grad for parameter in learner.network.parameters())
 
 
 class Killed(BaseException):

@@ -52,7 +52,7 @@ class Block(nn.Module):
             first_only: whether only the first token is wanted.
             closing: a norm that the rows go through at last.
         """
-        if self.compiled and layer.can_compute(rows, length, self.heads, self.feedforward_in.out_features):
+        if self.compiled and layer.can_compute(rows, length, self.heads, self.feedforward_in.weight):
             parts = (
                 *(self.attention_norm, self.query_key_value, self.attention_out),
                 *(self.feedforward_norm, self.feedforward_in, self.feedforward_out),

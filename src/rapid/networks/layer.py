@@ -44,10 +44,13 @@ ROWS = 128
 """Tokens that are computed together: their numbers stay in a processor's second cache."""
 
 
-def can_compute(rows: Tensor, length: int, heads: int, inner: int) -> bool:
-    """Whether :func:`compute` is made for samples of so many of these tokens (B*T, D), and so wide a layer (F)."""
-    fits = length <= LANES and rows.shape[1] % (LANES * heads) == 0 and inner % LANES == 0
-    return fits and is_plain(rows)
+def can_compute(rows: Tensor, length: int, heads: int, weight: Tensor) -> bool:
+    """Whether :func:`compute` is made for samples of so many of these tokens (B*T, D), and such a layer.
+
+    `weight` is that of the first layer of its feed-forward network (F, D).
+    """
+    fits = length <= LANES and rows.shape[1] % (LANES * heads) == 0 and len(weight) % LANES == 0
+    return fits and is_plain(rows) and is_plain(weight)
 
 
 def is_plain(rows: Tensor) -> bool:
