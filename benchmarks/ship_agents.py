@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import rapid
+from rapid.agents.monitored import CALM, WARY, is_monitored
 from rapid.agents.onnx import driven_observations, export_onnx
 from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent
 from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, shipped_adversaries, shipped_agents
@@ -68,6 +70,16 @@ MADE = {
         "RAPID, squeezed features",
         "strong, plan squeezed",
         _MIXED + "; 1,000,000 online steps, then 600,000 by squeezed features, two thirds of them under attack",
+    ),
+    "wary": Made(
+        "RAPID, wary",
+        "strong, plan wary",
+        _MIXED + "; 1,000,000 online steps, then 500,000 by squeezed features, all under attack",
+    ),
+    "monitored": Made(
+        "RAPID, monitored",
+        "strong, plans ppo and wary",
+        _MIXED + "; 1,000,000 online steps, then another policy from there for 500,000 more, all under attack",
     ),
 }
 LIMITS = (
@@ -125,7 +137,7 @@ def renew_cards() -> None:
 
 def exported(home: Path, scenario: str) -> dict[str, Any] | str:
     """Write an agent's ONNX file, and return its hash and how far it is from the agent, or why there is none."""
-    agent = load_agent(home)
+    agent = rapid.load_agent(home)
     try:
         seen = driven_observations(agent, scenario, spawn_seeds("test", 4))
         parity = export_onnx(agent, home / ONNX_FILE, *seen)
@@ -184,7 +196,7 @@ def main() -> None:
         parser.error("give the directory of an agent, its name and what it is, or --cards")
     if (chosen.name == "adversary") != bool(chosen.victim):
         parser.error("an adversary has a --victim, and nothing else has")
-    agent = load_agent(chosen.agent)
+    agent = rapid.load_agent(chosen.agent)
     if chosen.victim:
         ship_adversary(chosen.agent, agent.metadata, chosen.name, chosen.summary, chosen.victim, chosen.spawns)
         return
@@ -210,13 +222,17 @@ def main() -> None:
                 )
             rows += load_rows(part)
     home = PACKAGE / scenario.replace(":", "-") / "agents" / chosen.name
-    write_bytes(home / WEIGHTS_FILE, (chosen.agent / WEIGHTS_FILE).read_bytes())
-    config = read_json(chosen.agent / CONFIG_FILE, "agent")
-    for name in ("from", "data"):  # where they lay on this machine is nobody's business
-        if name in config["metadata"]:
-            config["metadata"][name] = Path(config["metadata"][name]).name
-    config["metadata"]["name"] = MADE[chosen.name].label
-    write_json(home / CONFIG_FILE, config)
+    policies = [CALM, WARY] if is_monitored(chosen.agent) else [""]
+    for policy in policies:
+        write_bytes(home / policy / WEIGHTS_FILE, (chosen.agent / policy / WEIGHTS_FILE).read_bytes())
+    for part in dict.fromkeys(["", *policies]):
+        config = read_json(chosen.agent / part / CONFIG_FILE, "agent")
+        for name in ("from", "data"):  # where they lay on this machine is nobody's business
+            if name in config["metadata"]:
+                config["metadata"][name] = Path(config["metadata"][name]).name
+        if not part:
+            config["metadata"]["name"] = MADE[chosen.name].label
+        write_json(home / part / CONFIG_FILE, config)
     write_json(
         home / CARD_FILE,
         {
@@ -228,14 +244,14 @@ def main() -> None:
             "scores": scores(rows),
             "scores_are": f"One training over {chosen.spawns} test spawns. {SIZES}",
             **made(scenario, chosen.name),
-            "weights_sha256": read_json(home / CONFIG_FILE, "agent")["weights_sha256"],
+            "weights_sha256": " ".join(sha256(home / policy / WEIGHTS_FILE) for policy in policies),
             "onnx": exported(home, scenario),
             "commit": commit(),
             "licence": "Apache-2.0",
             "limits": LIMITS,
         },
     )
-    print(f"{home}: {sum(path.stat().st_size for path in home.iterdir()) / 1e3:.0f} kB")
+    print(f"{home}: {sum(path.stat().st_size for path in home.rglob('*')) / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

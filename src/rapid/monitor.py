@@ -14,11 +14,13 @@ Shapes: B batch, V vehicles, F features, A actions, S entries of a state, R some
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rapid.defences import matched
-from rapid.networks.memory import SPEED, STATE_SIZE, ego_bounds
+from rapid.networks.memory import SPEED, STATE_SIZE, ego_bounds, initial_state, next_state
 from rapid.scenarios import NUM_FEATURES
 
 SPEED_ERROR = 0.05
@@ -30,6 +32,25 @@ BEHIND, BEYOND = (9.0, 14.0), (4.75, 5.5)
 be. So hard do drivers brake where episodes begin too dense."""
 CARS = 2
 """Cars that must be where none could be; one alone may be another that has come into view beside it."""
+
+
+def own_size(vehicles: int) -> int:
+    """Return S of what the monitor itself remembers: the doubt, what the car knows, and what was seen before."""
+    return 1 + STATE_SIZE + vehicles * NUM_FEATURES
+
+
+def own_start(worlds: int, vehicles: int, lanes: int) -> NDArray[np.float32]:
+    """Return what the monitor itself remembers (B, S) where an episode begins."""
+    own_BS = np.zeros((worlds, own_size(vehicles)), np.float32)
+    own_BS[:, 1 : 1 + STATE_SIZE] = initial_state(worlds, lanes)
+    return own_BS
+
+
+def own_next(own_BS: NDArray[np.float32], action_B: NDArray[np.int64], lanes: int) -> NDArray[np.float32]:
+    """Return what the monitor itself remembers (B, S) after these actions."""
+    moved_BS = own_BS.copy()
+    moved_BS[:, 1 : 1 + STATE_SIZE] = next_state(own_BS[:, 1 : 1 + STATE_SIZE], action_B, lanes)
+    return moved_BS
 
 
 class MonitorState(NamedTuple):
@@ -66,7 +87,7 @@ class MonitoredNetwork(nn.Module):
     @property
     def own_size(self) -> int:
         """S of what the monitor itself remembers; the states of the two policies follow."""
-        return 1 + STATE_SIZE + self.vehicles * NUM_FEATURES
+        return own_size(self.vehicles)
 
     def parts(self, state_BS: Tensor) -> MonitorState:
         """Return the parts of a state (B, S)."""

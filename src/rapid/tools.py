@@ -69,12 +69,12 @@ def export(options: Export, config: Config) -> int:
     import torch
 
     from rapid.agents.onnx import driven_observations, export_onnx, latency
-    from rapid.agents.open import network_agent
+    from rapid.agents.open import exportable_agent
     from rapid.data.batch import with_rows
     from rapid.data.dataset import load_dataset
     from rapid.spawns import spawn_seeds
 
-    agent = network_agent(options.agent)
+    agent = exportable_agent(options.agent)
     out = options.out or f"{Path(options.agent.rpartition(':')[2]).resolve()}.onnx"
     if options.dataset:
         obs_NVF = load_dataset(options.dataset).transitions.obs_NVF

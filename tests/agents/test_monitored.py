@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rapid.agents.monitored import MonitoredAgent, load_monitored, save_monitored
-from rapid.agents.open import check_road, network_agent, open_agent, own_scenario
+from rapid.agents.onnx import OnnxAgent, driven_observations, export_onnx
+from rapid.agents.open import check_road, exportable_agent, network_agent, open_agent, own_scenario
 from rapid.agents.saved import CONFIG_FILE, load_agent, moved_on
 from rapid.attacks import get_attack
 from rapid.attacks.attack import values_of
-from rapid.cli import main
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.monitor import BEHIND, CARS, SPEED_ERROR, contradicts
@@ -181,7 +181,46 @@ def test_it_is_saved_with_both_policies_and_drives_as_before(tmp_path: Path):
         assert [row.episode_return for row in ours] == [row.episode_return for row in spec]
 
 
-def test_clear_errors_before_anything_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize("scenario", PAPER_SCENARIOS)
+def test_as_one_onnx_file_it_notices_and_drives_as_before(tmp_path: Path, scenario: str):
+    calm, wary = f"shipped:{scenario}/rapid", f"shipped:{scenario}/squeezed"
+    agent = exportable_agent(f"monitored:{calm},{wary}")
+    parity = export_onnx(agent, tmp_path / "both.onnx", *driven_observations(agent, scenario, spawn_seeds("tune", 4)))
+    assert parity.difference < 1e-3
+    exported, seeds, lanes = OnnxAgent(tmp_path / "both.onnx"), spawn_seeds("tune", 12), agent.network.lanes
+    assert exported.remembered_lanes == agent.remembered_lanes
+    np.testing.assert_array_equal(exported.start(2), agent.start(2))
+    for attack in ("none", "uniform:radius=0.02", "gaussian"):
+        ours = run_episodes(agent, scenario, seeds, get_attack(attack, lanes)).rows()
+        theirs = run_episodes(exported, scenario, seeds, get_attack(attack, lanes)).rows()
+        np.testing.assert_allclose(
+            [row.episode_return for row in ours], [row.episode_return for row in theirs], err_msg=attack
+        )
+
+
+def test_the_state_that_its_onnx_file_returns_is_what_it_remembers(tmp_path: Path, driven: list):
+    agent = exportable_agent(SPEC)
+    export_onnx(agent, tmp_path / "both.onnx", *driven_observations(agent, SCENARIO, spawn_seeds("tune", 2)))
+    exported = OnnxAgent(tmp_path / "both.onnx")
+    rng = np.random.default_rng(0)
+    obs = driven[0][0]
+    state = agent.start(len(obs))
+    for step in range(6):
+        obs = driven[step][0][: len(state)]
+        state = state[: len(obs)]
+        # From the fourth step on every third world is lied to, about other cars alone.
+        seen = obs.copy()
+        seen[::3, 1:, 1] += (step >= 3) * rng.uniform(-40, 40, seen[::3, 1:, 1].shape).astype(np.float32)
+        action = agent.act(seen, state)
+        (returned,) = exported.session.run(["next_state"], exported.inputs(seen, state))
+        np.testing.assert_array_equal(exported.notice(seen, state), agent.notice(seen, state))
+        state = moved_on(agent, seen, state, action)
+        np.testing.assert_allclose(returned, state, atol=1e-4)
+        assert step < 3 or state[::3, 0].all()
+        assert not state[1::3, 0].any()
+
+
+def test_clear_errors_before_anything_is_driven(tmp_path: Path):
     for spec, words in (
         ("monitored:rapid", "does not name two agents"),
         ("monitored:,x", "does not name two agents"),
@@ -189,8 +228,10 @@ def test_clear_errors_before_anything_is_driven(tmp_path: Path, capsys: pytest.C
     ):
         with pytest.raises(RapidError, match=words):
             open_agent(spec, SCENARIO)
-    with pytest.raises(RapidError, match="neither exported nor certified"):
+    with pytest.raises(RapidError, match="nothing is certified of the monitor"):
         network_agent(SPEC)
+    with pytest.raises(RapidError, match="behind a defence"):
+        exportable_agent(f"monitored:smooth:3:{CALM},{WARY}")
     with pytest.raises(RapidError, match="road of 3 lanes"):
         check_road(open_agent(SPEC, SCENARIO), PAPER_SCENARIOS[1])
     with pytest.raises(RapidError, match="lane-4"):
@@ -199,10 +240,6 @@ def test_clear_errors_before_anything_is_driven(tmp_path: Path, capsys: pytest.C
     save_monitored(folder, Path(CALM), Path(WARY), {"scenario": SCENARIO})
     with pytest.raises(RapidError, match="two policies with a monitor"):
         load_agent(folder)
-    with pytest.raises(SystemExit) as ended:
-        main(["export", str(folder)])
-    assert ended.value.code == 2
-    assert "one is wanted here" in capsys.readouterr().err
     config = json.loads((folder / CONFIG_FILE).read_text())
     for changes, words in (({"version": 9}, "format version 9"), ({"metadata": {}}, "does not tell its scenario")):
         (folder / CONFIG_FILE).write_text(json.dumps(config | changes))

@@ -20,8 +20,8 @@ from rapid.attacks.attack import network_of
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import Kind
 from rapid.files import read_json, write_json
-from rapid.monitor import MonitoredNetwork
-from rapid.networks.memory import STATE_SIZE, initial_state, next_state
+from rapid.monitor import MonitoredNetwork, own_next, own_start
+from rapid.networks.memory import STATE_SIZE
 from rapid.scenarios import NUM_VEHICLES, get_scenario
 from rapid.text import printable
 
@@ -83,10 +83,8 @@ class MonitoredAgent(Watchable):
 
     def start(self, worlds: int) -> NDArray[np.float32]:
         """Return the states (B, S) with which episodes begin."""
-        own_BS = np.zeros((worlds, self.network.own_size), np.float32)
-        own_BS[:, 1 : 1 + STATE_SIZE] = initial_state(worlds, self.network.lanes)
         inner = [agent.start(worlds) for agent in (self.calm, self.wary) if remembers(agent)]
-        return np.concatenate([own_BS, *inner], 1)
+        return np.concatenate([own_start(worlds, self.vehicles, self.network.lanes), *inner], 1)
 
     def notice(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the states (B, S) after this was seen."""
@@ -98,12 +96,11 @@ class MonitoredAgent(Watchable):
     def remember(self, state_BS: NDArray[np.float32], action_B: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return the states (B, S) after these actions."""
         own_BS, *inner = self._split(state_BS)
-        own_BS[:, 1 : 1 + STATE_SIZE] = next_state(own_BS[:, 1 : 1 + STATE_SIZE], action_B, self.network.lanes)
         moved = [
             agent.remember(inner_BS, action_B) if remembers(agent) else inner_BS
             for agent, inner_BS in zip((self.calm, self.wary), inner, strict=True)
         ]
-        return np.concatenate([own_BS, *moved], 1)
+        return np.concatenate([own_next(own_BS, action_B, self.network.lanes), *moved], 1)
 
     def _split(self, state_BS: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         own = self.network.own_size

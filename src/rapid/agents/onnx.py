@@ -2,7 +2,8 @@
 
 The model reads `obs` (batch, V, 5), float32, raw as the environment gives it, and returns `q` (batch, 5). That of an
 agent with a memory also reads `state` (batch, 6) and returns `next_state`, which is given back at the next step; an
-episode begins with [0, 6, 25, 0, lanes - 1, 0] (:mod:`rapid.networks.memory`).
+episode begins with [0, 6, 25, 0, lanes - 1, 0] (:mod:`rapid.networks.memory`). The state of two policies with a monitor
+between them is longer (:mod:`rapid.monitor`).
 """
 
 import json
@@ -15,12 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rapid import files
+from rapid.agents.monitored import MonitoredAgent
+from rapid.agents.onnx_monitor import build_monitored_model
 from rapid.agents.onnx_network import build_model
 from rapid.agents.q_agent import QAgent, check_observations
-from rapid.agents.saved import NAME_LENGTH
+from rapid.agents.saved import NAME_LENGTH, moved_on, remembers
 from rapid.agents.watchable import Watchable
 from rapid.errors import RapidError, how_to_install, sentence
-from rapid.networks.memory import initial_state, next_state
+from rapid.monitor import own_next, own_size, own_start
+from rapid.networks.memory import STATE_SIZE, initial_state, next_state
 from rapid.scenarios import ACTIONS, FEATURES, MAX_VEHICLES, MIN_VEHICLES, NUM_FEATURES, NUM_VEHICLES, seeing
 from rapid.text import printable
 
@@ -65,6 +69,9 @@ class OnnxAgent(Watchable):
         found = [size for size in sizes if shape[1:] in ([size, NUM_FEATURES], [size * NUM_FEATURES])]
         self.metadata = _metadata(self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}"), path)
         self.has_memory = bool(self.metadata.get("memory"))
+        self.monitored = bool(self.metadata.get("monitored"))
+        """Whether it is two policies with a monitor between them."""
+        self._memories = int(self.metadata.get("memories", 1))
         if [item.name for item in inputs[1:]] != [STATE] * self.has_memory or not found:
             raise RapidError(
                 f"The ONNX model '{path}' reads {[(item.name, item.shape) for item in inputs]}, but an agent reads one "
@@ -100,11 +107,25 @@ class OnnxAgent(Watchable):
 
     def start(self, worlds: int) -> np.ndarray:
         """Return the states (B, S), float32, with which episodes begin."""
-        return initial_state(worlds, int(self.metadata["lanes"]))
+        lanes = int(self.metadata["lanes"])
+        own = [own_start(worlds, self.vehicles, lanes)] if self.monitored else []
+        return np.concatenate([*own, *[initial_state(worlds, lanes)] * self._memories], 1)
+
+    def notice(self, obs_BVF: np.ndarray, state_BS: np.ndarray) -> np.ndarray:
+        """Return the states (B, S) after this was seen, which only a monitor remembers."""
+        if not self.monitored:
+            return state_BS
+        after_BS = self.session.run(["next_state"], self.inputs(obs_BVF, state_BS))[0]
+        seen_BS = state_BS.copy()
+        for part in (slice(1), slice(1 + STATE_SIZE, own_size(self.vehicles))):
+            seen_BS[:, part] = after_BS[:, part]
+        return seen_BS
 
     def remember(self, state_BS: np.ndarray, action_B: np.ndarray) -> np.ndarray:
         """Return the states (B, S) after these actions."""
-        return next_state(state_BS, action_B, int(self.metadata["lanes"]))
+        lanes, own = int(self.metadata["lanes"]), own_size(self.vehicles) if self.monitored else 0
+        inner = [next_state(part_BS, action_B, lanes) for part_BS in np.split(state_BS[:, own:], self._memories, 1)]
+        return np.concatenate([own_next(state_BS[:, :own], action_B, lanes) if own else state_BS[:, :0], *inner], 1)
 
     def act(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> np.ndarray:
         """Return the greedy actions (B,), int64.
@@ -179,7 +200,10 @@ class Parity(NamedTuple):
 
 
 def export_onnx(
-    agent: QAgent, path: str | os.PathLike[str], obs_BVF: np.ndarray, state_BS: np.ndarray | None = None
+    agent: QAgent | MonitoredAgent,
+    path: str | os.PathLike[str],
+    obs_BVF: np.ndarray,
+    state_BS: np.ndarray | None = None,
 ) -> Parity:
     """Write an agent's network as ONNX and compare the two on given observations.
 
@@ -203,24 +227,29 @@ def export_onnx(
     obs_BVF = check_observations(obs_BVF, agent.name, agent.vehicles)
     if not len(obs_BVF):
         raise RapidError("There are no observations to compare the exported model on. Give a dataset with transitions.")
-    network = agent.network
-    description = {
+    description: dict[str, Any] = {
         "name": agent.name,
-        "lanes": network.lanes,
+        "lanes": agent.network.lanes,
         "features": FEATURES,
         "actions": ACTIONS,
-        "mirrored_lanes": agent.mirrored_lanes,
         "memory": agent.has_memory,
-        "shielded_lanes": agent.shielded_lanes,
-        "shield": network.config.shield,
     }
+    if isinstance(agent, MonitoredAgent):
+        model = build_monitored_model(agent.network)
+        description |= {"monitored": True, "memories": sum(map(remembers, (agent.calm, agent.wary)))}
+    else:
+        model = build_model(agent.network)
+        description |= {
+            "mirrored_lanes": agent.mirrored_lanes,
+            "shielded_lanes": agent.shielded_lanes,
+            "shield": agent.network.config.shield,
+        }
     if agent.has_memory and state_BS is None:
         state_BS = agent.start(len(obs_BVF))
-    model = build_model(network)
     onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(description)})
     with files.atomic_path(path) as temporary:
         onnx.save(model, os.fspath(temporary))
-        expected = agent.q_values(obs_BVF, state_BS)
+        expected = agent.q_values(obs_BVF, *(() if state_BS is None else (state_BS,)))
         exported = OnnxAgent(temporary, agent.name).q_values(obs_BVF, state_BS)
         difference = float(np.abs(exported - expected).max())
         allowed = TOLERANCE * max(1.0, float(np.abs(expected).max()))
@@ -240,7 +269,7 @@ def export_onnx(
     return Parity(len(obs_BVF), difference, float((exported.argmax(1) == expected.argmax(1)).mean()))
 
 
-def driven_observations(agent: QAgent, scenario: str, seeds: Sequence[int]) -> tuple[np.ndarray, np.ndarray | None]:
+def driven_observations(agent: Any, scenario: str, seeds: Sequence[int]) -> tuple[np.ndarray, np.ndarray | None]:
     """Return every observation (B, V, F) that the agent meets in one episode of each spawn seed.
 
     Beside them what it remembers there (B, S), if it has a memory.
@@ -252,11 +281,11 @@ def driven_observations(agent: QAgent, scenario: str, seeds: Sequence[int]) -> t
     met, running_W = [np.array(obs_WVF)], np.ones(len(seeds), np.bool_)
     states = [agent.start(len(seeds))] if agent.has_memory else []
     while running_W.any():
-        action_W = agent.act(met[-1], states[-1] if states else None)
+        action_W = agent.act(met[-1], *states[-1:])
         obs_WVF, _, terminated_W, truncated_W, _ = worlds.step(action_W)
         met.append(np.array(obs_WVF))
         if states:
-            states.append(agent.remember(states[-1], action_W))
+            states.append(moved_on(agent, met[-2], states[-1], action_W))
         running_W &= ~(terminated_W | truncated_W)
     worlds.close()
     return np.concatenate(met), np.concatenate(states) if states else None

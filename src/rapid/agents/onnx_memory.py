@@ -95,8 +95,8 @@ def recalled(graph: Graph, memory: Memory, obs: str, state: str) -> Names:
     return Names(*(graph.cut(out, start, end, 1) for start, end in itertools.pairwise(ends)))
 
 
-def next_state(graph: Graph, memory: Memory, state: str, q: str) -> str:
-    """Return the states (B, S) after the greedy actions."""
+def next_state(graph: Graph, lanes: int, state: str, q: str) -> str:
+    """Return the states (B, S) after the greedy actions, on a road with so many lanes."""
     action = graph.node("ArgMax", q, axis=1, keepdims=1)
 
     def taken(index: int) -> str:
@@ -119,8 +119,8 @@ def next_state(graph: Graph, memory: Memory, state: str, q: str) -> str:
         graph.node("Add", entry(STEPS), 1.0),
         index,
         graph.node("Add", target, graph.node("Mul", above, LAG)),
-        _clipped(graph, graph.node("Add", entry(LEFTMOST), moved), memory.lanes - 1),
-        _clipped(graph, graph.node("Add", entry(RIGHTMOST), moved), memory.lanes - 1),
+        _clipped(graph, graph.node("Add", entry(LEFTMOST), moved), lanes - 1),
+        _clipped(graph, graph.node("Add", entry(RIGHTMOST), moved), lanes - 1),
         graph.node("Add", entry(DISTANCE), driven),
         axis=1,
     )

@@ -38,17 +38,18 @@ def build_model(network: QNetwork) -> Any:
     import onnx
 
     graph, memory = Graph(onnx, network.config.vehicles), network.memory
-    _q_values(graph, network)
+    q_values(graph, network, "state")
     # The Q-values are what the last node gives.
     graph.nodes[-1].output[0] = "q"
     if memory is not None:
-        next_state(graph, memory, "state", "q")
+        next_state(graph, memory.lanes, "state", "q")
         graph.nodes[-1].output[0] = "next_state"
     return graph.model(0 if memory is None else STATE_SIZE)
 
 
-def _q_values(graph: Graph, network: QNetwork) -> str:
-    q = _unfiltered(graph, network)
+def q_values(graph: Graph, network: QNetwork, state: str) -> str:
+    """Return the Q-values (B, A) of `obs`, and of a state (B, S) if the network has a memory."""
+    q = _unfiltered(graph, network, state)
     if not network.config.shield:
         return q
     arrays = Arrays(graph)
@@ -56,27 +57,27 @@ def _q_values(graph: Graph, network: QNetwork) -> str:
     return filter_values(arrays, arrays.of(q), margins(arrays, arrays.of("obs"), network.lanes, box)).name
 
 
-def _unfiltered(graph: Graph, network: QNetwork) -> str:
+def _unfiltered(graph: Graph, network: QNetwork, state: str) -> str:
     if not network.config.mirror:
-        return _seen(graph, network, "obs")
+        return _seen(graph, network, "obs", state)
     # The road and its mirror image as one batch.
     encoding = network.encoding
     turned = graph.node("Add", graph.node("Mul", "obs", array(encoding.turned_F)), array(encoding.far_side_F))
     present = graph.node("Greater", graph.cut("obs", 0, 1, 2), array(encoding.absent_V1))
     both = graph.node("Concat", "obs", graph.node("Where", present, turned, "obs"), axis=0)
-    both = graph.reshape(_seen(graph, network, both), 2, -1, NUM_ACTIONS)
+    both = graph.reshape(_seen(graph, network, both, state), 2, -1, NUM_ACTIONS)
     actions = graph.constant(MIRRORED_ACTIONS, np.int64)
     mirrored = graph.node("Gather", graph.cut(both, 1, 2, 0), actions, axis=2)
     total = graph.node("Add", graph.cut(both, 0, 1, 0), mirrored)
     return graph.reshape(graph.node("Mul", total, 0.5), -1, NUM_ACTIONS)
 
 
-def _seen(graph: Graph, network: QNetwork, obs: str) -> str:
+def _seen(graph: Graph, network: QNetwork, obs: str, state: str) -> str:
     """Return the Q-values (B, A) of observations as they are."""
     head, encoding = network.head, network.encoding
     names = None
     if network.memory is not None:
-        names, obs = recalled(graph, network.memory, obs, "state"), believed(graph, network.memory, obs, "state")
+        names, obs = recalled(graph, network.memory, obs, state), believed(graph, network.memory, obs, state)
     features, read_GF = obs, np.eye(NUM_FEATURES, dtype=np.float32)
     if encoding.kind == "normalized":
         read_GF /= array(encoding.scale_F)

@@ -20,6 +20,7 @@ from rapid.seeding import stream_seed
 from rapid.teacher.decision import Decision
 
 if TYPE_CHECKING:
+    from rapid.agents.monitored import MonitoredAgent
     from rapid.agents.q_agent import QAgent
 
 PLANNERS = ("planner", "planner-cars", "planner-observation")
@@ -173,7 +174,7 @@ def network_agent(spec: str, device: str = "cpu") -> "QAgent":
         )
     if spec.startswith(MONITORED):
         raise RapidError(
-            f"'{spec}' is two policies with a monitor between them, which is neither exported nor certified. Give one "
+            f"'{spec}' is two policies with a monitor between them, and nothing is certified of the monitor. Give one "
             f"of the two: {' or '.join(monitored_parts(spec))}."
         )
     if spec.startswith(SHIELD):
@@ -181,6 +182,20 @@ def network_agent(spec: str, device: str = "cpu") -> "QAgent":
         agent = network_agent(inner, device)
         return shielded(agent, box, agent.network.lanes)
     return load_agent(spec, device)
+
+
+def exportable_agent(spec: str) -> "QAgent | MonitoredAgent":
+    """Return the agent that `spec` names, if it can be exported: of one network, or of two with a monitor between them.
+
+    Raises:
+        RapidError: `spec` names none, or another kind of agent.
+    """
+    from rapid.agents.monitored import MonitoredAgent, is_monitored, load_monitored
+
+    if spec.startswith(MONITORED):
+        calm, wary = map(network_agent, monitored_parts(spec))
+        return MonitoredAgent(calm, wary, own_scenario([spec]))
+    return load_monitored(spec) if is_monitored(spec) else network_agent(spec)
 
 
 def check_road(agent: Any, scenario: str) -> None:
