@@ -305,7 +305,7 @@ def _wary(adapt: AdaptConfig) -> AdaptConfig:
         train="all",
         memory=True,
         squeeze=True,
-        ppo=replace(calm.ppo, num_envs=512, batch_size=2_048, learning_rate=3e-4, largest_kl=0.03, critic_steps=50_000),
+        ppo=replace(calm.ppo, num_envs=512, learning_rate=3e-4, largest_kl=0.03, critic_steps=50_000),
         adversary=replace(calm.adversary, gradient_share=0.6, noise_share=0.25, guided=0.13),
     )
 
