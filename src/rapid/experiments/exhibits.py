@@ -51,6 +51,7 @@ ROBUST_METHODS = (
     "rapid-robust",
     "rapid-guided",
     "rapid-squeezed",
+    "rapid-monitored",
 )
 
 
@@ -226,6 +227,7 @@ ALL: dict[str, Exhibit] = {
                     "rapid-robust",
                     "rapid-guided",
                     "rapid-squeezed",
+                    "rapid-monitored",
                 ),
             ),
             recipes=("strong",),

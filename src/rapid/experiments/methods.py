@@ -21,7 +21,6 @@ from rapid.experiments.learned import (
     robust,
     squeezed,
     the_teacher,
-    wary,
     without,
 )
 
@@ -110,7 +109,6 @@ METHODS: dict[str, Method] = {
         ),
         Method("rapid-guided", "RAPID, guided under attack", "learned", guided),
         Method("rapid-squeezed", "RAPID, squeezed features, under attack", "learned", squeezed),
-        Method("rapid-wary", "RAPID, wary", "learned", wary),
         Method("rapid-monitored", "RAPID, monitored", "learned", monitored),
         Method("mlp-ppo", "MLP, 300K + 700K PPO", "learned", mlp_by_ppo),
         Method("online-ddqn-10k", "online DDQN, 10K", "learned", lambda s: from_scratch(s, "ddqn", "careful")),

@@ -27,7 +27,7 @@ from rapid.files import write_text
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
 BLOCK = re.compile(r"(<!-- table: ([\w:-]+) -->\n).*?(<!-- end -->)", re.S)
-WORKS = ("slower", "blind", "teacher", "offline-dqn", "rapid-ppo", "rapid-guided", "rapid-squeezed")
+WORKS = ("slower", "blind", "teacher", "offline-dqn", "rapid-ppo", "rapid-squeezed", "rapid-monitored")
 """Rows of README's table; the paper's own row stands above them."""
 
 
@@ -40,7 +40,7 @@ def _number(rows: Sequence[EpisodeRow]) -> str:
 
 ALGORITHMS = {
     "distil": ("distilled", "distilled-without-robust", "bc", "offline-dqn"),
-    "adapt": ("rapid-10k", "rapid", "rapid-ppo", "rapid-robust", "rapid-guided", "rapid-squeezed"),
+    "adapt": ("rapid-10k", "rapid", "rapid-ppo", "rapid-robust", "rapid-guided", "rapid-squeezed", "rapid-monitored"),
     "baselines": ("offline-dqn", "offline-ddqn", "cql", "bc", "online-dqn", "online-ddqn", "online-ppo", "mlp-ppo"),
 }
 """Rows of the table on each algorithm's page."""
