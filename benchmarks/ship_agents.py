@@ -74,12 +74,12 @@ MADE = {
     "wary": Made(
         "RAPID, wary",
         "strong, plan wary",
-        _MIXED + "; 1,000,000 online steps, then 500,000 by squeezed features, all under attack",
+        _MIXED + "; 1,000,000 online steps, then 500,000 by squeezed features, 85 % of the episodes under attack",
     ),
     "monitored": Made(
         "RAPID, monitored",
         "strong, plans ppo and wary",
-        _MIXED + "; 1,000,000 online steps, then another policy from there for 500,000 more, all under attack",
+        _MIXED + "; 1,000,000 online steps, then another policy for 500,000 more, 85 % of the episodes under attack",
     ),
 }
 LIMITS = (

@@ -20,6 +20,7 @@ import torch
 
 from rapid import files
 from rapid.agents import card as agent_card
+from rapid.agents.monitored import is_monitored
 from rapid.agents.onnx import TOLERANCE, OnnxAgent
 from rapid.agents.q_agent import QAgent
 from rapid.agents.saved import CONFIG_FILE, WEIGHTS_FILE, load_agent
@@ -201,8 +202,13 @@ def _repository(name: str) -> str:
 
 def _located(path: str | os.PathLike[str]) -> tuple[_Kind, Path]:
     """Return what is at a path, and its directory."""
+    is_set = is_shipped(path) and os.fspath(path).partition(":")[2] in shipped_sets()
+    if not is_set and is_monitored(path):
+        raise RapidError(
+            f"'{path}' is two policies with a monitor between them, and the Hub takes one agent at a time. Push "
+            f"'{agent_folder(path) / 'calm'}' and '{agent_folder(path) / 'wary'}', each into a repository of its own."
+        )
     if is_shipped(path):
-        is_set = os.fspath(path).partition(":")[2] in shipped_sets()
         return (_DATASET, dataset_folder(path)) if is_set else (_AGENT, agent_folder(path))
     folder = Path(path)
     for kind in (_DATASET, _AGENT):

@@ -109,7 +109,7 @@ class MonitoredNetwork(nn.Module):
         found = [
             _values(network, obs_BVF[rows_R], own_BS[rows_R])
             for network, own_BS, rows_R in ((self.calm, state.calm_BS, calm_R), (self.wary, state.wary_BS, wary_R))
-            if len(rows_R)
+            if len(rows_R) or not len(obs_BVF)
         ]
         # Back in the order of the batch.
         return torch.cat(found).index_select(0, torch.cat([calm_R, wary_R]).argsort())
@@ -125,6 +125,7 @@ def contradicts(obs_BVF: Tensor, own_BS: Tensor, before_BVF: Tensor, lanes: int)
     ego_BF = obs_BVF[:, 0]
     x_B, least_B, most_B = ego_BF[:, 1], lowest_B4[:, 0] - PLACE_ERROR, highest_B4[:, 0] + PLACE_ERROR
     wrong_speed_B = (torch.hypot(ego_BF[:, 3], ego_BF[:, 4]) - own_BS[:, SPEED]).abs() > SPEED_ERROR
+    wrong_speed_B |= ego_BF[:, 3] < lowest_B4[:, 2] - SPEED_ERROR
     ego_B = wrong_speed_B | (x_B < least_B) | (x_B > most_B)
 
     moved_BV2 = before_BVF[..., 1:3] + before_BVF[..., 3:5]

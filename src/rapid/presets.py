@@ -294,10 +294,10 @@ def _squeezed(adapt: AdaptConfig) -> AdaptConfig:
 
 
 def _wary(adapt: AdaptConfig) -> AdaptConfig:
-    """Return phase 3 by PPO with squeezed features, all of it under attack: for who drives once something is wrong.
+    """Return phase 3 by PPO with squeezed features, attacked from the first step: for who drives when lies are noticed.
 
     It begins with the plan of `blind`, which it is shown: by trying alone, it would brake for good. What is better than
-    a plan is found by large batches; small ones lose the plan first (docs/log/robustness.md).
+    a plan is found by large rollouts; small ones lose the plan first (docs/log/robustness.md).
     """
     calm = _far_sighted(adapt)
     return replace(

@@ -71,7 +71,8 @@ class Export:
     """Write an agent as ONNX, compare the two on real observations, and time a decision."""
 
     agent: Annotated[Positional[str], arg(metavar="AGENT")]
-    """Directory of the agent; with shield:BOX: before it, the interval filter becomes part of the model."""
+    """Directory of the agent; with shield:BOX: before it, the interval filter becomes part of the model. Or
+    monitored:CALM,WARY, two agents with a monitor between them."""
     out: str = ""
     """The file; by default AGENT.onnx, beside the agent's directory."""
     force: bool = False

@@ -69,12 +69,14 @@ def export(options: Export, config: Config) -> int:
     import torch
 
     from rapid.agents.onnx import driven_observations, export_onnx, latency
-    from rapid.agents.open import exportable_agent
+    from rapid.agents.open import MONITORED, exportable_agent
     from rapid.data.batch import with_rows
     from rapid.data.dataset import load_dataset
     from rapid.spawns import spawn_seeds
 
     agent = exportable_agent(options.agent)
+    if MONITORED in options.agent and not options.out:
+        raise RapidError("Two agents have no one directory, beside which the file could go. Say where: --out FILE.")
     out = options.out or f"{Path(options.agent.rpartition(':')[2]).resolve()}.onnx"
     if options.dataset:
         obs_NVF = load_dataset(options.dataset).transitions.obs_NVF

@@ -9,16 +9,19 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rapid import hub
 from rapid.agents.monitored import MonitoredAgent, load_monitored, save_monitored
 from rapid.agents.onnx import OnnxAgent, driven_observations, export_onnx
-from rapid.agents.open import check_road, exportable_agent, network_agent, open_agent, own_scenario
+from rapid.agents.open import check_road, exportable_agent, monitored_parts, network_agent, open_agent, own_scenario
 from rapid.agents.saved import CONFIG_FILE, load_agent, moved_on
 from rapid.attacks import get_attack
 from rapid.attacks.attack import values_of
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
+from rapid.files import sha256
 from rapid.monitor import BEHIND, CARS, SPEED_ERROR, contradicts
 from rapid.networks.memory import STATE_SIZE, initial_state
+from rapid.phases.adversary import train
 from rapid.scenarios import PAPER_SCENARIOS, SLOWER
 from rapid.simulator import make_vec
 from rapid.spawns import spawn_seeds
@@ -139,6 +142,55 @@ def test_a_doubt_lasts_until_the_episode_ends_and_rows_go_to_their_policies(driv
     assert not agent.doubts(driven[0][0], agent.start(len(obs))).any()
 
 
+@pytest.mark.parametrize(
+    ("spec", "parts"),
+    [
+        ("monitored:a,b", ("a", "b")),
+        ("monitored:shield:1m,0.5:a,b", ("shield:1m,0.5:a", "b")),
+        ("monitored:a,shield:1m,0.5:b", ("a", "shield:1m,0.5:b")),
+    ],
+)
+def test_the_comma_of_a_box_parts_no_agents(spec: str, parts: tuple[str, str]):
+    assert monitored_parts(spec) == parts
+
+
+def test_a_filter_before_it_is_a_filter_before_both_and_knows_its_scenario(driven: list):
+    spec = f"shield:0.1:{SPEC}"
+    agent = open_agent(spec, SCENARIO)
+    assert isinstance(agent, MonitoredAgent)
+    assert agent.network.calm.config.shield == agent.network.wary.config.shield == "0.1"
+    assert own_scenario([spec]) == SCENARIO
+    assert exportable_agent(spec).metadata["scenario"] == SCENARIO
+
+
+def test_two_without_a_memory_are_exported_too(tmp_path: Path):
+    agent = exportable_agent(f"monitored:{CALM},shipped:{SCENARIO}/distilled")
+    export_onnx(agent, tmp_path / "both.onnx", *driven_observations(agent, SCENARIO, spawn_seeds("tune", 2)))
+    exported, seeds = OnnxAgent(tmp_path / "both.onnx"), spawn_seeds("tune", 3)
+    ours, theirs = (run_episodes(each, SCENARIO, seeds).rows() for each in (agent, exported))
+    assert [row.episode_return for row in ours] == pytest.approx([row.episode_return for row in theirs])
+
+
+def test_policies_may_be_swapped_in_place_and_another_pair_is_another_agent(tmp_path: Path):
+    folder = tmp_path / "agent"
+    save_monitored(folder, Path(CALM), Path(WARY), {"scenario": SCENARIO})
+    first = sha256(folder / CONFIG_FILE)
+    save_monitored(folder, folder / "wary", folder / "calm", {"scenario": SCENARIO})
+    swapped = load_monitored(folder)
+    assert swapped.calm.network.config.squeeze
+    assert not swapped.wary.network.config.squeeze
+    # What was measured is kept by this hash.
+    assert sha256(folder / CONFIG_FILE) != first
+
+
+def test_an_adversary_can_be_trained_against_it(tmp_path: Path):
+    train(SPEC, SCENARIO, "adversary:steps=2", 60, tmp_path / "adversary")
+    rows = run_episodes(
+        open_agent(SPEC, SCENARIO), SCENARIO, spawn_seeds("tune", 2), get_attack(f"adversary:{tmp_path / 'adversary'}")
+    ).rows()
+    assert len(rows) == 2
+
+
 def test_its_memory_is_that_of_the_car():
     agent = open_agent(SPEC, SCENARIO)
     state = agent.start(3)
@@ -234,14 +286,35 @@ def test_clear_errors_before_anything_is_driven(tmp_path: Path):
         exportable_agent(f"monitored:smooth:3:{CALM},{WARY}")
     with pytest.raises(RapidError, match="road of 3 lanes"):
         check_road(open_agent(SPEC, SCENARIO), PAPER_SCENARIOS[1])
+    with pytest.raises(RapidError, match="road of 3 lanes"):
+        open_agent(SPEC, PAPER_SCENARIOS[1])
+    with pytest.raises(RapidError, match="dynamics of highway-v0"):
+        open_agent(SPEC, f"{SCENARIO}-fast")
+    with pytest.raises(RapidError, match="would take for a lie"):
+        open_agent(f"smooth:3:{SPEC}", SCENARIO)
+    with pytest.raises(RapidError, match="is an adversary"):
+        save_monitored(tmp_path / "no", Path(CALM), Path(f"shipped:{SCENARIO}/adversary"), {"scenario": SCENARIO})
+    with pytest.raises(RapidError, match="must tell its scenario"):
+        save_monitored(tmp_path / "no", Path(CALM), Path(WARY), {})
+    agent, obs = open_agent(SPEC, SCENARIO), np.zeros((2, 15, 5), np.float32)
+    for state in ((), (np.zeros((2, 6), np.float32),)):
+        with pytest.raises(RapidError, match="needs a state of shape"):
+            agent.act(obs, *state)
+    assert agent.act(obs[:0], agent.start(0)).shape == (0,)
     with pytest.raises(RapidError, match="lane-4"):
         own_scenario([f"monitored:{CALM},shipped:{PAPER_SCENARIOS[1]}/squeezed"])
     folder = tmp_path / "agent"
     save_monitored(folder, Path(CALM), Path(WARY), {"scenario": SCENARIO})
     with pytest.raises(RapidError, match="two policies with a monitor"):
         load_agent(folder)
+    with pytest.raises(RapidError, match="one agent at a time"):
+        hub._located(folder)
     config = json.loads((folder / CONFIG_FILE).read_text())
-    for changes, words in (({"version": 9}, "format version 9"), ({"metadata": {}}, "does not tell its scenario")):
+    for changes, words in (
+        ({"version": 9}, "format version 9"),
+        ({"metadata": {}}, "does not tell its scenario"),
+        ({"weights_sha256": {}}, "saved with"),
+    ):
         (folder / CONFIG_FILE).write_text(json.dumps(config | changes))
         with pytest.raises(RapidError, match=words):
             load_monitored(folder)

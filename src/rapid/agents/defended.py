@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rapid.agents.monitored import MonitoredAgent
 from rapid.agents.open import kind_of
 from rapid.agents.q_agent import check_observations
 from rapid.agents.saved import noticed, remembers
@@ -30,6 +31,11 @@ def defended(agent: Any, members: tuple[str, ...], scenario: str, seed: int = 0)
         RapidError: the agent has no Q-values, or there is no such defence.
     """
     name = str(getattr(agent, "name", type(agent).__name__))
+    if isinstance(agent, MonitoredAgent):
+        raise RapidError(
+            f"'{name}' has a monitor, which would take for a lie what a defence makes of what is seen. Put the defence "
+            "before one of the two policies: monitored:smooth:3:CALM,WARY."
+        )
     if callable(getattr(agent, "bind", None)) or not callable(getattr(agent, "q_values", None)):
         raise RapidError(
             f"'{name}' tells no Q-values of what it sees, and the defences without training ask for them. Give a saved "

@@ -1,7 +1,6 @@
 """Two agents as one, with a monitor between them (:mod:`rapid.monitor`); and such agents on disk."""
 
 import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rapid.agents import saved
-from rapid.agents.open import MONITORED
+from rapid.agents.open import MONITORED, check_road
 from rapid.agents.q_agent import QAgent, check_observations
 from rapid.agents.saved import CONFIG_FILE, MONITORED_FORMAT, WEIGHTS_FILE, noticed, remembers
 from rapid.agents.shipped import agent_folder
@@ -19,7 +18,7 @@ from rapid.agents.watchable import Watchable
 from rapid.attacks.attack import network_of
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import Kind
-from rapid.files import read_json, write_json
+from rapid.files import read_json, sha256, write_bytes, write_json
 from rapid.monitor import MonitoredNetwork, own_next, own_start
 from rapid.networks.memory import STATE_SIZE
 from rapid.scenarios import NUM_VEHICLES, get_scenario
@@ -40,14 +39,15 @@ class MonitoredAgent(Watchable):
         metadata: what was saved with it; a `name` there is its own.
 
     Raises:
-        RapidError: one of them has no network, or they read different numbers of vehicles.
+        RapidError: one of them has no network or is for another road, they read different numbers of vehicles, or the
+            scenario has dynamics that a car's memory does not know.
     """
 
     kind: Kind = "learned"
     has_memory = True
 
     def __init__(self, calm: Any, wary: Any, scenario: str, metadata: dict[str, Any] | None = None) -> None:
-        self.calm, self.wary, self.metadata = calm, wary, metadata or {}
+        self.calm, self.wary, self.scenario, self.metadata = calm, wary, scenario, metadata or {}
         names = [str(getattr(agent, "name", type(agent).__name__)) for agent in (calm, wary)]
         self.name = str(self.metadata.get("name") or f"{MONITORED}{','.join(names)}")
         rows = [int(getattr(agent, "vehicles", NUM_VEHICLES)) for agent in (calm, wary)]
@@ -57,29 +57,54 @@ class MonitoredAgent(Watchable):
                 "read as many."
             )
         self.vehicles = rows[0]
+        seen = get_scenario(scenario)
+        if seen.dynamics != "v0":
+            raise RapidError(
+                f"A monitor knows how a car moves with the dynamics of highway-v0, and {scenario} has others, so that "
+                "it would doubt everything. Drive it in a scenario without '-fast'."
+            )
+        for agent in (calm, wary):
+            check_road(agent, scenario)
         size = calm.start(1).shape[1] if remembers(calm) else 0
-        lanes = get_scenario(scenario).lanes
         networks = _network(calm, names[0]), _network(wary, names[1])
-        self.network = MonitoredNetwork(*networks, size, self.vehicles, lanes).eval()
+        self.network = MonitoredNetwork(*networks, size, self.vehicles, seen.lanes).eval()
+        self._size = self.start(1).shape[1]
+
+    def __repr__(self) -> str:
+        return f"<MonitoredAgent '{self.name}': {self.calm!r}, then {self.wary!r}>"
 
     @property
     def remembered_lanes(self) -> int:
         """On roads with how many lanes its memory is right."""
         return self.network.lanes
 
-    def act(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the greedy actions (B,)."""
+    def act(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32] | None = None) -> NDArray[np.int64]:
+        """Return the greedy actions (B,).
+
+        Raises:
+            RapidError: the observations or the states have the wrong shape, or are not finite.
+        """
         return self.q_values(obs_BVF, state_BS).argmax(1)
 
     @torch.inference_mode()
-    def q_values(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the Q-values (B, A) of the policy that drives."""
-        return self.network(self._seen(obs_BVF), self._tensor(state_BS)).cpu().numpy()
+    def q_values(
+        self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Return the Q-values (B, A) of the policy that drives.
+
+        Raises:
+            RapidError: the observations or the states have the wrong shape, or are not finite.
+        """
+        return self.network(*self._given(obs_BVF, state_BS)).cpu().numpy()
 
     @torch.inference_mode()
-    def doubts(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return whether the wary agent drives (B,)."""
-        return self.network.doubts(self._seen(obs_BVF), self._tensor(state_BS)).cpu().numpy()
+    def doubts(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
+        """Return whether the wary agent drives (B,).
+
+        Raises:
+            RapidError: the observations or the states have the wrong shape, or are not finite.
+        """
+        return self.network.doubts(*self._given(obs_BVF, state_BS)).cpu().numpy()
 
     def start(self, worlds: int) -> NDArray[np.float32]:
         """Return the states (B, S) with which episodes begin."""
@@ -106,8 +131,14 @@ class MonitoredAgent(Watchable):
         own = self.network.own_size
         return np.split(state_BS.copy(), [own, own + self.network.calm_size], 1)
 
-    def _seen(self, obs_BVF: NDArray[np.float32]) -> Tensor:
-        return self._tensor(check_observations(obs_BVF, self.name, self.vehicles))
+    def _given(self, obs_BVF: NDArray[np.float32], state_BS: NDArray[np.float32] | None) -> tuple[Tensor, Tensor]:
+        obs_BVF = check_observations(obs_BVF, self.name, self.vehicles)
+        if state_BS is None or state_BS.shape != (len(obs_BVF), self._size):
+            raise RapidError(
+                f"Agent '{self.name}' needs a state of shape {(len(obs_BVF), self._size)} beside the observations, but "
+                f"was given {'none' if state_BS is None else state_BS.shape}: agent.start(worlds) gives the first."
+            )
+        return self._tensor(obs_BVF), self._tensor(state_BS)
 
     def _tensor(self, values: NDArray[np.float32]) -> Tensor:
         device = next(self.network.parameters()).device
@@ -134,15 +165,31 @@ def save_monitored(directory: str | os.PathLike[str], calm: Path, wary: Path, me
         metadata: plain JSON values: how it was made; `scenario` tells where it drives.
 
     Raises:
-        RapidError: one of them cannot be read or does not fit the other, or the directory cannot be written.
+        RapidError: one of them cannot be read, drives nothing, or does not fit the other; `metadata` has no scenario;
+            or the directory cannot be written.
     """
-    MonitoredAgent(saved.load_agent(calm), saved.load_agent(wary), metadata["scenario"])
+    if not isinstance(metadata.get("scenario"), str):
+        raise RapidError("The metadata of a monitored agent must tell its scenario. Add it.")
+    first, second = saved.load_agent(calm), saved.load_agent(wary)
+    for agent in (first, second):
+        if agent.metadata.get("adversary_of"):
+            raise RapidError(f"'{agent.name}' is an adversary, which drives nothing. Give an agent that does.")
+    MonitoredAgent(first, second, metadata["scenario"])
     folder = Path(directory)
-    for name, source in ((CALM, calm), (WARY, wary)):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-        for file in (WEIGHTS_FILE, CONFIG_FILE):
-            shutil.copyfile(agent_folder(source) / file, folder / name / file)
-    write_json(folder / CONFIG_FILE, {"format": MONITORED_FORMAT, "version": VERSION, "metadata": metadata})
+    # All is read before anything is written: one may lie where the other goes.
+    content = {
+        name: {file: (agent_folder(source) / file).read_bytes() for file in (WEIGHTS_FILE, CONFIG_FILE)}
+        for name, source in ((CALM, calm), (WARY, wary))
+    }
+    for name, parts in content.items():
+        for file, data in parts.items():
+            write_bytes(folder / name / file, data)
+    (folder / WEIGHTS_FILE).unlink(missing_ok=True)
+    weights = {name: sha256(folder / name / WEIGHTS_FILE) for name in content}
+    write_json(
+        folder / CONFIG_FILE,
+        {"format": MONITORED_FORMAT, "version": VERSION, "weights_sha256": weights, "metadata": metadata},
+    )
 
 
 def is_monitored(directory: str | os.PathLike[str]) -> bool:
@@ -171,6 +218,12 @@ def load_monitored(directory: str | os.PathLike[str], device: str = "cpu") -> Mo
     if not isinstance(metadata, dict) or not isinstance(metadata.get("scenario"), str):
         raise RapidError(f"The agent '{folder}' is damaged: {CONFIG_FILE} does not tell its scenario. Save it again.")
     metadata["name"] = printable(str(metadata.get("name") or folder.resolve().name))
+    for name in (CALM, WARY):
+        weights = folder / name / WEIGHTS_FILE
+        if not weights.is_file() or config.get("weights_sha256", {}).get(name) != sha256(weights):
+            raise RapidError(
+                f"The agent '{folder}' is damaged: '{name}' is not the agent that it was saved with. Save it again."
+            )
     calm, wary = (saved.load_agent(folder / name, device) for name in (CALM, WARY))
     return MonitoredAgent(calm, wary, metadata["scenario"], metadata)
 

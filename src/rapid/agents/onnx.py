@@ -72,6 +72,7 @@ class OnnxAgent(Watchable):
         self.monitored = bool(self.metadata.get("monitored"))
         """Whether it is two policies with a monitor between them."""
         self._memories = int(self.metadata.get("memories", 1))
+        """How many of its policies have a memory."""
         if [item.name for item in inputs[1:]] != [STATE] * self.has_memory or not found:
             raise RapidError(
                 f"The ONNX model '{path}' reads {[(item.name, item.shape) for item in inputs]}, but an agent reads one "
@@ -83,6 +84,12 @@ class OnnxAgent(Watchable):
             raise RapidError(
                 f"The ONNX model '{path}' returns shape {outputs[0].shape}, but an agent returns Q-values (batch, "
                 f"{len(ACTIONS)}), one for each of {', '.join(ACTIONS)}. Export it with that output."
+            )
+        size = STATE_SIZE * self._memories + (own_size(self.vehicles) if self.monitored else 0)
+        if self.has_memory and list(inputs[1].shape)[1:] != [size]:
+            raise RapidError(
+                f"The ONNX model '{path}' reads states of shape {inputs[1].shape}, but by what it says of itself they "
+                f"are (batch, {size}). Export it again."
             )
         self.flat = len(shape) == 2
         self.name = printable(name or Path(path).stem)[:NAME_LENGTH]
@@ -124,7 +131,8 @@ class OnnxAgent(Watchable):
     def remember(self, state_BS: np.ndarray, action_B: np.ndarray) -> np.ndarray:
         """Return the states (B, S) after these actions."""
         lanes, own = int(self.metadata["lanes"]), own_size(self.vehicles) if self.monitored else 0
-        inner = [next_state(part_BS, action_B, lanes) for part_BS in np.split(state_BS[:, own:], self._memories, 1)]
+        parts = np.split(state_BS[:, own:], self._memories, 1) if self._memories else []
+        inner = [next_state(part_BS, action_B, lanes) for part_BS in parts]
         return np.concatenate([own_next(state_BS[:, :own], action_B, lanes) if own else state_BS[:, :0], *inner], 1)
 
     def act(self, obs_BVF: np.ndarray, state_BS: np.ndarray | None = None) -> np.ndarray:
@@ -181,7 +189,10 @@ def _metadata(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         found = json.loads(text)
         lanes = [found.get(key) for key in ("mirrored_lanes", "shielded_lanes", "lanes")]
-        if all(of is None or (type(of) is int and of > 0) for of in lanes) and (lanes[2] or not found.get("memory")):
+        memories = found.get("memories", 1)
+        counted = type(memories) is int and 0 <= memories <= 2
+        known = all(of is None or (type(of) is int and of > 0) for of in lanes)
+        if counted and known and (lanes[2] or not found.get("memory")):
             return found
     except (ValueError, AttributeError, RecursionError):
         pass

@@ -1,5 +1,6 @@
 """One way to ask all that can drive: agents, teachers that hear their last decision, planners in the world."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast, get_args
@@ -124,7 +125,9 @@ def monitored_parts(spec: str) -> tuple[str, str]:
     Raises:
         RapidError: it does not name two.
     """
-    calm, _, wary = spec.removeprefix(MONITORED).rpartition(",")
+    # The comma of a box such as shield:1m,0.5: stands before a number and a colon.
+    found = re.fullmatch(r"(.*),(?!\s*[\d.]+:)(.*)", spec.removeprefix(MONITORED), re.S)
+    calm, wary = found.groups() if found else ("", "")
     if not calm.strip() or not wary.strip():
         raise RapidError(
             f"'{spec}' does not name two agents. Expected monitored:CALM,WARY: who drives while what is seen can be "
@@ -143,11 +146,11 @@ def own_scenario(specs: Sequence[str]) -> str:
     left = list(specs)
     while left:
         spec = left.pop(0)
+        while (shield := spec.startswith(SHIELD)) or is_defence(spec):
+            spec = spec[len(SHIELD) :].partition(":")[2] if shield else unwrapped(spec).agent
         if spec.startswith(MONITORED):
             left = [*monitored_parts(spec), *left]
             continue
-        while (shield := spec.startswith(SHIELD)) or is_defence(spec):
-            spec = spec[len(SHIELD) :].partition(":")[2] if shield else unwrapped(spec).agent
         path = agent_folder(spec) / "config.json"
         if path.is_file():
             metadata = read_json(path, "agent").get("metadata", {})
@@ -191,10 +194,16 @@ def exportable_agent(spec: str) -> "QAgent | MonitoredAgent":
         RapidError: `spec` names none, or another kind of agent.
     """
     from rapid.agents.monitored import MonitoredAgent, is_monitored, load_monitored
+    from rapid.agents.shielded import shielded
 
+    box, colon, inner = spec.removeprefix(SHIELD).partition(":")
+    if spec.startswith(SHIELD) and colon:
+        agent = exportable_agent(inner)
+        return shielded(agent, box, agent.network.lanes)
     if spec.startswith(MONITORED):
         calm, wary = map(network_agent, monitored_parts(spec))
-        return MonitoredAgent(calm, wary, own_scenario([spec]))
+        scenario = own_scenario([spec])
+        return MonitoredAgent(calm, wary, scenario, {"scenario": scenario})
     return load_monitored(spec) if is_monitored(spec) else network_agent(spec)
 
 

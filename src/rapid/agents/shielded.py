@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rapid.agents.monitored import MonitoredAgent
 from rapid.agents.open import kind_of
 from rapid.agents.q_agent import QAgent
 from rapid.agents.watchable import Watchable
@@ -19,7 +20,8 @@ from rapid.scenarios import SLOWER
 def shielded(agent: Any, box: str, lanes: int) -> Any:
     """Return the agent behind the interval filter, called ``shield:BOX:NAME``; `agent` itself is left as it is.
 
-    A network gets the filter behind its Q-values, so that gradients and exports see it. So does whoever tells its
+    A network gets the filter behind its Q-values, so that gradients and exports see it, and of two with a monitor
+    between them both do. So does whoever tells its
     Q-values: the best action that passes is taken. Of all others, an action that does not pass becomes SLOWER.
 
     Args:
@@ -38,6 +40,9 @@ def shielded(agent: Any, box: str, lanes: int) -> Any:
         network.config = replace(network.config, shield=box)
         return QAgent(network, name, agent.metadata)
     filter_ = IntervalFilter(lanes, box)
+    if isinstance(agent, MonitoredAgent):
+        calm, wary = (shielded(each, box, lanes) for each in (agent.calm, agent.wary))
+        return MonitoredAgent(calm, wary, agent.scenario, {**agent.metadata, "name": name})
     if callable(getattr(agent, "bind", None)):
         return ShieldedPlanner(agent, filter_, name)
     if callable(getattr(agent, "act", None)):

@@ -24,8 +24,9 @@ class Block(nn.Module):
     def __init__(self, width: int, heads: int, feedforward: int) -> None:
         super().__init__()
         self.heads = heads
-        self.compiled = False
-        """Whether it is computed by :mod:`rapid.networks.layer` where it can be: faster, and rounded otherwise."""
+        self.compiled = 0
+        """Not 0: it is computed by :mod:`rapid.networks.layer` where it can be, which is faster, and rounded otherwise.
+        It counts who wants that, for one may begin before another has ended."""
         self.attention_norm = nn.LayerNorm(width)
         self.query_key_value = nn.Linear(width, 3 * width)
         self.attention_out = nn.Linear(width, width)
@@ -98,8 +99,8 @@ class Block(nn.Module):
 class Projection(nn.Linear):
     """A linear layer that reads the few features of a vehicle."""
 
-    compiled = False
-    """Whether its gradient is by :mod:`rapid.networks.layer`: faster on a CPU, and rounded otherwise."""
+    compiled = 0
+    """Not 0: its gradient is by :mod:`rapid.networks.layer`, which is faster on a CPU, and rounded otherwise."""
 
     def forward(self, input: Tensor) -> Tensor:
         """Return the rows (..., D) of features (..., F)."""
@@ -113,14 +114,13 @@ def compiled_layers(*networks: nn.Module) -> Generator[None]:
     """Let the layers of some networks be computed by :mod:`rapid.networks.layer` meanwhile."""
     modules = [module for network in networks for module in network.modules()]
     layers = [module for module in modules if isinstance(module, Block | Projection)]
-    before = [each.compiled for each in layers]
     for each in layers:
-        each.compiled = True
+        each.compiled += 1
     try:
         yield
     finally:
-        for each, was in zip(layers, before, strict=True):
-            each.compiled = was
+        for each in layers:
+            each.compiled -= 1
 
 
 @contextmanager

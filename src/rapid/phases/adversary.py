@@ -2,7 +2,7 @@
 
 import os
 
-from rapid.agents.saved import load_agent
+from rapid.agents.open import open_agent
 from rapid.attacks.adversary import save_adversary, train_adversary
 from rapid.attacks.spec import parse_attack
 from rapid.errors import RapidError
@@ -16,7 +16,7 @@ def train(
     """Train an adversary and save it; return the agent's mean return in the first and in the last round.
 
     Args:
-        agent: directory of the agent.
+        agent: the agent: its directory, or another spec of one with a network.
         scenario: where it is attacked.
         attack: text of an attack of kind `adversary`, without a source.
         steps: decisions to learn from.
@@ -34,7 +34,7 @@ def train(
     if steps < 1:
         raise RapidError(f"--steps is {steps}, but must be at least 1.")
     get_scenario(scenario)
-    victim, returns = load_agent(agent), list[float]()
+    victim, returns = open_agent(str(agent), scenario), list[float]()
     with task(f"adversary of {victim.name}", steps, "steps") as work:
 
         def progress(done: float, mean: float) -> None:

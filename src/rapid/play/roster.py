@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rapid.agents.open import PLANNERS, check_road, open_agent
-from rapid.agents.saved import CONFIG_FILE, FORMAT
+from rapid.agents.saved import CONFIG_FILE, FORMAT, MONITORED_FORMAT
 from rapid.agents.shipped import shipped_agents
 from rapid.config import TeacherConfig
 from rapid.data.shipped import SHIPPED
@@ -137,7 +137,7 @@ def _is_agent(path: Path) -> bool:
         content = read_json(path)
     except RapidError:
         return False
-    return isinstance(content, dict) and content.get("format") == FORMAT
+    return isinstance(content, dict) and content.get("format") in (FORMAT, MONITORED_FORMAT)
 
 
 def _shipped(name: str) -> Entry:
