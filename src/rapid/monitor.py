@@ -125,7 +125,6 @@ def contradicts(obs_BVF: Tensor, own_BS: Tensor, before_BVF: Tensor, lanes: int)
     ego_BF = obs_BVF[:, 0]
     x_B, least_B, most_B = ego_BF[:, 1], lowest_B4[:, 0] - PLACE_ERROR, highest_B4[:, 0] + PLACE_ERROR
     wrong_speed_B = (torch.hypot(ego_BF[:, 3], ego_BF[:, 4]) - own_BS[:, SPEED]).abs() > SPEED_ERROR
-    wrong_speed_B |= ego_BF[:, 3] < lowest_B4[:, 2] - SPEED_ERROR
     ego_B = wrong_speed_B | (x_B < least_B) | (x_B > most_B)
 
     moved_BV2 = before_BVF[..., 1:3] + before_BVF[..., 3:5]

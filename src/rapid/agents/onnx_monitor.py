@@ -13,7 +13,7 @@ from rapid.agents.onnx_network import q_values
 from rapid.defences import CAR_UNITS
 from rapid.errors import RapidError
 from rapid.monitor import BEHIND, BEYOND, CARS, PLACE_ERROR, SPEED_ERROR, MonitoredNetwork
-from rapid.networks.memory import DELAY, DISTANCE, SLANT, SPEED, START_TOLERANCE, STATE_SIZE, STEPS, start_x
+from rapid.networks.memory import DELAY, DISTANCE, SPEED, START_TOLERANCE, STATE_SIZE, STEPS, start_x
 from rapid.networks.q_network import QNetwork
 from rapid.scenarios import NUM_FEATURES
 
@@ -78,11 +78,7 @@ def _contradicts(graph: Graph, memory: str, before: str, lanes: int) -> str:
     room = START_TOLERANCE + PLACE_ERROR
     ego_wrong = graph.node(
         "Or",
-        graph.node(
-            "Or",
-            outside(faster, -SPEED_ERROR, SPEED_ERROR),
-            graph.node("Less", along, graph.node("Sub", known(SPEED), SLANT + SPEED_ERROR)),
-        ),
+        outside(faster, -SPEED_ERROR, SPEED_ERROR),
         outside(graph.cut(ego, X, X + 1, 1), graph.node("Sub", late, room), graph.node("Add", place, room)),
     )
     there, fast = graph.node("Add", feature(before, X), feature(before, VX)), feature(before, VX)
