@@ -18,7 +18,7 @@ NAMES = shipped_agents()
 
 
 def test_there_are_some():
-    drivers = ("distilled", "mlp", "rapid", "rapid-10k", "robust", "squeezed")
+    drivers = ("distilled", "mlp", "monitored", "rapid", "rapid-10k", "robust", "squeezed", "wary")
     everywhere = {f"{scenario}/{name}" for scenario in PAPER_SCENARIOS for name in drivers}
     assert everywhere | {"lane-3-density-2/guided"} == set(NAMES)
     assert shipped_adversaries() == tuple(f"{scenario}/adversary" for scenario in PAPER_SCENARIOS)
