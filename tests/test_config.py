@@ -66,7 +66,13 @@ def test_the_paper_recipe_is_the_printed_one():
 def test_a_scale_changes_sizes_only():
     sizes = {
         *("scale", "mix.size", "distill.iterations", "distill.evaluate_every", "adapt.steps", "adapt.ppo.steps"),
-        *("adapt.ppo.critic_steps", "adapt.buffer_size", "adapt.learning_starts", "adapt.evaluate_every"),
+        *(
+            "adapt.ppo.critic_steps",
+            "adapt.ppo.num_envs",
+            "adapt.buffer_size",
+            "adapt.learning_starts",
+            "adapt.evaluate_every",
+        ),
         *("collect.teacher_transitions", "collect.random_transitions", "collect.lockstep"),
         *(f"evaluate.{name}spawns" for name in ("", "teacher_", "planner_", "curve_")),
     }

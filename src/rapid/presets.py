@@ -178,7 +178,7 @@ def _resized(config: Config) -> Config:
     tiny = config.scale == "tiny"
     ppo = replace(adapt.ppo, steps=ppo_steps)
     if tiny:
-        ppo = replace(ppo, critic_steps=3_840, num_envs=min(ppo.num_envs, 128), batch_size=min(ppo.batch_size, 512))
+        ppo = replace(ppo, critic_steps=3_840, num_envs=min(ppo.num_envs, 128))
     return replace(
         config,
         collect=collect,
