@@ -299,14 +299,11 @@ def _wary(adapt: AdaptConfig) -> AdaptConfig:
     It begins with the plan of `blind`, which it is shown: by trying alone, it would brake for good. What is better than
     a plan is found by large rollouts; small ones lose the plan first (docs/log/robustness.md).
     """
-    calm = _far_sighted(adapt)
+    squeezed = _squeezed(adapt)
     return replace(
-        calm,
-        train="all",
-        memory=True,
-        squeeze=True,
-        ppo=replace(calm.ppo, num_envs=512, learning_rate=3e-4, largest_kl=0.03, critic_steps=50_000),
-        adversary=replace(calm.adversary, gradient_share=0.6, noise_share=0.25, guided=0.13),
+        squeezed,
+        ppo=replace(squeezed.ppo, num_envs=512, learning_rate=3e-4, entropy=0.0, largest_kl=0.03, critic_steps=50_000),
+        adversary=replace(squeezed.adversary, noise_share=0.25, begin=0.0, ramp=0.0, guided=0.13),
     )
 
 
