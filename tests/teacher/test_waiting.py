@@ -172,8 +172,10 @@ def test_nothing_is_begun_or_waited_for_beyond_the_end(server, crowd):
     with pytest.raises(UnfinishedError, match="Enough") as caught:
         teacher.decide(crowd[:6], [None] * 6)
     assert time.monotonic() - start < 8
-    assert [decision is not None for decision in caught.value.decisions] == [True, True, False, False, False, False]
+    # Which two were answered is the threads' affair: a third may reach the server before the second.
+    assert sum(decision is not None for decision in caught.value.decisions) == 2
     sent = len(server.requests)
+    assert sent == 4
     with pytest.raises(UnfinishedError):
         teacher.decide(crowd[:6], [None] * 6)
     assert len(server.requests) == sent
