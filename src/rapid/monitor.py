@@ -19,19 +19,28 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rapid.defences import matched
 from rapid.networks.memory import SPEED, STATE_SIZE, ego_bounds, initial_state, next_state
+from rapid.road import LANE_WIDTH, SIGHT
 from rapid.scenarios import NUM_FEATURES
 
 SPEED_ERROR = 0.05
 """m/s by which the ego's speed may be seen wrong: what it knows of its own is exact but for rounding."""
-PLACE_ERROR = 2.0
+PLACE_ERROR = 8.0
 """Metres by which its place may lie outside of what is known of it, which is not known exactly."""
-BEHIND, BEYOND = (9.0, 14.0), (4.75, 5.5)
-"""How much less and more than was expected a second before another car's place [m] and speed [m/s] along the road may
-be. So hard do drivers brake where episodes begin too dense."""
-CARS = 2
-"""Cars that must be where none could be; one alone may be another that has come into view beside it."""
+SLOWER_BY, FASTER_BY = 22.0, 6.5
+"""m/s by which another car's speed may have changed within a second: a driver brakes or speeds up by 6 at most, and a
+car that crashes keeps a third of its speed."""
+STRAY = 2.5
+"""Metres by which its way may differ from what both speeds, the one before and the one now, would have made of it."""
+ASIDE, ASIDE_SPEED = 5.0, 6.5
+"""Metres that it may move across the road within a second, or be pushed by a crash, and m/s."""
+COMING = 22.0
+"""Metres from the edge of what is seen within which a car may have come or gone since."""
+CRUISE, STRAIGHT, OFF_LANE = 8.0, 0.02, 1.0
+"""A car that is faster than this along the road and slower than this across it [m/s] is at most so far from the middle
+of a lane [m]."""
+FIRST_SPEEDS, FIRST_ERROR = (21.0, 24.0), 0.05
+"""Where an episode begins, other cars drive in the middle of lanes and straight on, so fast [m/s], but for this."""
 
 
 def own_size(vehicles: int) -> int:
@@ -118,23 +127,75 @@ class MonitoredNetwork(nn.Module):
 def contradicts(obs_BVF: Tensor, own_BS: Tensor, before_BVF: Tensor, lanes: int) -> Tensor:
     """Return whether what is seen cannot be true (B,), given what the car knows and what was seen a second before.
 
-    That is: the ego is seen elsewhere, or at another speed, than its own actions brought it to; or several cars that
-    were seen before are where, or as fast as, no car could be now.
+    That is: the ego is seen elsewhere, or at another speed, than its own actions brought it to; or other cars are seen
+    where, or as fast as, none can be.
     """
     lowest_B4, highest_B4 = ego_bounds(own_BS, lanes)
     ego_BF = obs_BVF[:, 0]
     x_B, least_B, most_B = ego_BF[:, 1], lowest_B4[:, 0] - PLACE_ERROR, highest_B4[:, 0] + PLACE_ERROR
     wrong_speed_B = (torch.hypot(ego_BF[:, 3], ego_BF[:, 4]) - own_BS[:, SPEED]).abs() > SPEED_ERROR
     ego_B = wrong_speed_B | (x_B < least_B) | (x_B > most_B)
+    first_B = before_BVF[:, 0, 0] < 0.5
+    others_B = torch.where(first_B, impossible_start(obs_BVF), impossible_move(obs_BVF, before_BVF))
+    return ego_B | others_B | impossible_sight(obs_BVF)
 
-    moved_BV2 = before_BVF[..., 1:3] + before_BVF[..., 3:5]
-    expected_BVF = torch.cat([before_BVF[..., :1], moved_BV2, before_BVF[..., 3:]], -1)
-    row_BV, known_BV = matched(obs_BVF, expected_BVF)
-    known_BV[:, 0] = False
-    away_BVF = obs_BVF - expected_BVF.gather(1, row_BV[..., None].expand_as(expected_BVF))
-    along_BV, faster_BV = away_BVF[..., 1], away_BVF[..., 3]
-    far_BV = (along_BV < -BEHIND[0]) | (along_BV > BEYOND[0]) | (faster_BV < -BEHIND[1]) | (faster_BV > BEYOND[1])
-    return ego_B | ((known_BV & far_BV).sum(1) >= CARS)
+
+def impossible_sight(obs_BVF: Tensor) -> Tensor:
+    """Return whether another car drives as none does (B,): too fast across the road, or straight on between lanes."""
+    here_BV, (_, across_BV, along_speed_BV, across_speed_BV) = obs_BVF[:, 1:, 0] > 0.5, obs_BVF[:, 1:, 1:].unbind(-1)
+    straight_BV = (along_speed_BV > CRUISE) & (across_speed_BV.abs() < STRAIGHT)
+    between_BV = straight_BV & (_off_lane(across_BV) > OFF_LANE)
+    return (here_BV & (between_BV | (across_speed_BV.abs() > ASIDE_SPEED))).any(1)
+
+
+def impossible_start(obs_BVF: Tensor) -> Tensor:
+    """Return whether another car is seen as none is where an episode begins (B,)."""
+    here_BV, (_, across_BV, along_speed_BV, across_speed_BV) = obs_BVF[:, 1:, 0] > 0.5, obs_BVF[:, 1:, 1:].unbind(-1)
+    least, most = FIRST_SPEEDS[0] - FIRST_ERROR, FIRST_SPEEDS[1] + FIRST_ERROR
+    wrong_speed_BV = (along_speed_BV < least) | (along_speed_BV > most) | (across_speed_BV.abs() > FIRST_ERROR)
+    return (here_BV & (wrong_speed_BV | (_off_lane(across_BV) > FIRST_ERROR))).any(1)
+
+
+def impossible_move(obs_BVF: Tensor, before_BVF: Tensor) -> Tensor:
+    """Return whether other cars are seen that cannot be, given what was seen a second before (B,).
+
+    Each car that is seen must be one that was seen before, as far and as fast as cars move, or have come into view; and
+    each that was seen before must still be seen, or have left it.
+    """
+    now_BVF, was_BVF = obs_BVF[:, 1:], before_BVF[:, 1:]
+    here_BV, there_BV = now_BVF[..., 0] > 0.5, was_BVF[..., 0] > 0.5
+    expected_BV = was_BVF[..., 1] + was_BVF[..., 3]
+    # (B, cars now, cars before)
+    along_BVV = now_BVF[:, :, None, 1] - expected_BV[:, None]
+    across_BVV = now_BVF[:, :, None, 2] - was_BVF[:, None, :, 2]
+    faster_BVV = now_BVF[:, :, None, 3] - was_BVF[:, None, :, 3]
+    possible_BVV = (
+        (along_BVV >= faster_BVV.clamp(max=0) - STRAY)
+        & (along_BVV <= faster_BVV.clamp(min=0) + STRAY)
+        & (faster_BVV >= -SLOWER_BY)
+        & (faster_BVV <= FASTER_BY)
+        & (across_BVV.abs() <= ASIDE)
+        & here_BV[:, :, None]
+        & there_BV[:, None]
+    )
+    from_BV = now_BVF[..., 1] - now_BVF[..., 3]
+    came_BV = here_BV & ~possible_BVV.any(2) & _well_in_view(from_BV, before_BVF)
+    went_BV = there_BV & ~possible_BVV.any(1) & _well_in_view(expected_BV, obs_BVF)
+    return (came_BV | went_BV).any(1)
+
+
+def _off_lane(across_BV: Tensor) -> Tensor:
+    """Return how far from the middle of the nearest lane that is [m]."""
+    return (across_BV - (across_BV / LANE_WIDTH).round() * LANE_WIDTH).abs()
+
+
+def _well_in_view(x_BV: Tensor, obs_BVF: Tensor) -> Tensor:
+    """Return whether a car at these places [m] was surely among those seen: they are the nearest, or all in sight."""
+    ego_B1 = obs_BVF[:, :1, 1]
+    present_BV = obs_BVF[:, 1:, 0] > 0.5
+    away_BV = (obs_BVF[:, 1:, 1] - ego_B1).abs()
+    farthest_B = torch.where(present_BV.all(1), away_BV.amax(1), SIGHT)
+    return (x_BV - ego_B1).abs() < farthest_B[:, None] - COMING
 
 
 def _values(network: nn.Module, obs_BVF: Tensor, state_BS: Tensor) -> Tensor:

@@ -19,18 +19,33 @@ from rapid.attacks.attack import values_of
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import run_episodes
 from rapid.files import sha256
-from rapid.monitor import BEHIND, CARS, SPEED_ERROR, contradicts
+from rapid.monitor import (
+    ASIDE,
+    ASIDE_SPEED,
+    COMING,
+    CRUISE,
+    FASTER_BY,
+    FIRST_ERROR,
+    FIRST_SPEEDS,
+    OFF_LANE,
+    SLOWER_BY,
+    SPEED_ERROR,
+    STRAIGHT,
+    STRAY,
+    contradicts,
+    own_next,
+    own_start,
+)
 from rapid.networks.memory import STATE_SIZE, initial_state
 from rapid.phases.adversary import train
-from rapid.scenarios import PAPER_SCENARIOS, SLOWER
+from rapid.road import LANE_WIDTH, SIGHT
+from rapid.scenarios import FEATURES, PAPER_SCENARIOS, SLOWER, get_scenario
 from rapid.simulator import make_vec
 from rapid.spawns import spawn_seeds
 
 SCENARIO = "lane-3-density-2"
 CALM, WARY = f"shipped:{SCENARIO}/rapid", f"shipped:{SCENARIO}/squeezed"
 SPEC = f"monitored:{CALM},{WARY}"
-SENSOR = np.array([0, 1, 1, 0.5, 0.5], np.float32)
-"""What a good sensor may err by: m and m/s."""
 
 
 @pytest.fixture(scope="module")
@@ -74,20 +89,6 @@ def test_under_noise_the_wary_policy_drives_from_the_first_decision():
     assert np.mean(same) > 0.8
 
 
-@settings(max_examples=60, deadline=None)
-@given(moment=st.integers(0, 29), seed=st.integers(0, 2**32 - 1), size=st.floats(0, 1))
-def test_an_error_of_a_sensor_about_the_others_is_no_contradiction(driven: list, moment: int, seed: int, size: float):
-    obs, own, before = driven[min(moment, len(driven) - 1)]
-    rng = np.random.default_rng(seed)
-
-    def wrong(true: np.ndarray) -> np.ndarray:
-        error = rng.uniform(-size, size, true.shape).astype(np.float32) * SENSOR * (true[..., :1] > 0.5)
-        error[:, 0] = 0
-        return true + error
-
-    assert not doubted(wrong(obs), own, wrong(before)).any()
-
-
 @pytest.mark.parametrize(("feature", "moved"), [(1, 40.0), (1, -40.0), (3, 0.5), (3, -0.5), (4, 10.0)])
 def test_a_lie_about_the_ego_is_noticed_at_once(driven: list, feature: int, moved: float):
     for obs, own, before in driven:
@@ -106,22 +107,138 @@ def test_a_hundredth_of_the_paper_s_attack_is_noticed(driven: list):
     assert doubted(seen, own, before).all()
 
 
-def test_cars_that_jump_are_noticed_and_one_alone_is_not(driven: list):
+def impossible(now: np.ndarray, before: np.ndarray) -> bool:
+    """What the monitor asks of the other cars of one world, car by car."""
+
+    def edge(rows: np.ndarray) -> float:
+        others = rows[1:]
+        full = (others[:, 0] > 0.5).all()
+        return float(np.abs(others[:, 1] - rows[0, 1]).max() if full else SIGHT) - COMING
+
+    def off_lane(car: np.ndarray) -> float:
+        return float(np.abs(car[2] - LANE_WIDTH * np.arange(-9, 20)).min())
+
+    def may_be(car: np.ndarray, earlier: np.ndarray) -> bool:
+        faster = car[3] - earlier[3]
+        way = car[1] - earlier[1]
+        slow, fast = sorted((car[3], earlier[3]))
+        driven = slow - STRAY <= way <= fast + STRAY
+        return driven and -SLOWER_BY <= faster <= FASTER_BY and abs(car[2] - earlier[2]) <= ASIDE
+
+    here, there = ([car for car in rows[1:] if car[0] > 0.5] for rows in (now, before))
+    for car in here:
+        if abs(car[4]) > ASIDE_SPEED or (car[3] > CRUISE and abs(car[4]) < STRAIGHT and off_lane(car) > OFF_LANE):
+            return True
+    if before[0, 0] < 0.5:
+        least, most = FIRST_SPEEDS[0] - FIRST_ERROR, FIRST_SPEEDS[1] + FIRST_ERROR
+        return any(not least <= car[3] <= most or max(abs(car[4]), off_lane(car)) > FIRST_ERROR for car in here)
+    for car in here:
+        in_view = abs(car[1] - car[3] - before[0, 1]) < edge(before)
+        if in_view and not any(may_be(car, earlier) for earlier in there):
+            return True
+    for earlier in there:
+        in_view = abs(earlier[1] + earlier[3] - now[0, 1]) < edge(now)
+        if in_view and not any(may_be(car, earlier) for car in here):
+            return True
+    return False
+
+
+@settings(max_examples=60, deadline=None)
+@given(moment=st.integers(0, 29), seed=st.integers(0, 2**32 - 1), size=st.floats(0, 0.1), share=st.floats(0, 1))
+def test_the_cars_are_judged_as_one_by_one(driven: list, moment: int, seed: int, size: float, share: float):
+    obs, own, before = driven[min(moment, len(driven) - 1)]
+    rng = np.random.default_rng(seed)
+
+    def wrong(true: np.ndarray) -> np.ndarray:
+        moved = rng.uniform(-size, size, true.shape).astype(np.float32) * np.array([0, 200, 12, 80, 80], np.float32)
+        moved *= (true[..., :1] > 0.5) & (rng.random(true.shape[:2])[..., None] < share)
+        moved[:, 0] = 0
+        return true + moved
+
+    seen, remembered = wrong(obs), wrong(before)
+    expected = [impossible(*both) for both in zip(seen, remembered, strict=True)]
+    assert doubted(seen, own, remembered).tolist() == expected
+
+
+def with_one_car(rows: np.ndarray, ahead: float, **changes: float) -> np.ndarray:
+    """The ego and one car `ahead` m of it in the middle of a lane, 22 m/s, but for the changes; nobody else."""
+    rows = np.where(np.arange(15)[:, None] < 1, rows, 0).astype(np.float32)
+    rows[:, 1] = np.stack([np.array([1, x + ahead, 4, 22, 0]) for x in rows[:, 0, 1]])
+    for feature, value in changes.items():
+        rows[:, 1, FEATURES.index(feature)] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("moved", "changes", "strange"),
+    [
+        (0, {}, False),
+        (STRAY - 0.5, {}, False),
+        (STRAY + 0.5, {}, True),
+        (-STRAY - 0.5, {}, True),
+        # It brakes by 6 m/s, and comes 3 m less far; or is said to brake, and has come as far as it could not.
+        (-3, {"vx": 16}, False),
+        (STRAY + 0.5, {"vx": 16}, True),
+        (0, {"vx": 22 + FASTER_BY + 1}, True),
+        (0, {"vx": -1}, True),
+        (0, {"y": 5.5, "vy": 1}, False),
+        (0, {"y": 5.5}, True),
+        (0, {"y": 10, "vy": 1}, True),
+        (0, {"vy": ASIDE_SPEED + 1}, True),
+    ],
+)
+def test_one_car_that_does_what_none_can_is_noticed(driven: list, moved: float, changes: dict, strange: bool):
     obs, own, before = driven[5]
-    assert not doubted(obs, own, before).any()
-    near = obs[..., 0] > 0.5
-    jump = BEHIND[0] + 1
-    for cars in range(4):
-        seen = obs.copy()
-        for world in range(len(obs)):
-            rows = np.flatnonzero(near[world])[1 : 1 + cars]
-            # Alone on the road: who is matched with whom is beyond doubt.
-            others = np.setdiff1d(np.arange(1, 15), rows)
-            seen[world, others] = 0
-            seen[world, rows, 1] = before[world, rows, 1] + before[world, rows, 3] - jump
-            seen[world, rows, 2:] = before[world, rows, 2:]
-        assert doubted(seen, own, before).all() == (cars >= CARS)
-        assert doubted(seen, own, before).any() == (cars >= CARS)
+    remembered = with_one_car(before, 60)
+    way = before[:, 0, 1] + 60 + 22 + moved - obs[:, 0, 1]
+    seen = np.concatenate([with_one_car(obs[w : w + 1], ahead, **changes) for w, ahead in enumerate(way)])
+    assert (doubted(seen, own, remembered) == strange).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "strange"), [({}, False), ({"y": 4.5}, True), ({"vy": 0.5}, True), ({"vx": 25}, True)]
+)
+def test_where_an_episode_begins_cars_drive_straight_on_in_their_lanes(driven: list, changes: dict, strange: bool):
+    obs, own, before = driven[0]
+    assert not before.any()
+    assert (doubted(with_one_car(obs, 50, **changes), own, before) == strange).all()
+
+
+def test_a_car_that_vanishes_or_appears_in_full_view_is_noticed_and_one_at_the_edge_is_not(driven: list):
+    obs, own, before = driven[5]
+    alone = [np.where(np.arange(15)[:, None] < 1, rows, 0) for rows in (obs, before)]
+    for ahead, strange in ((50, True), (5 - SIGHT, False), (SIGHT - 5, False)):
+        assert (doubted(with_one_car(obs, ahead), own, alone[1]) == strange).all()
+        assert (doubted(alone[0], own, with_one_car(before, ahead)) == strange).all()
+
+
+@pytest.mark.parametrize("driver", ["robust", "monitored"])
+@pytest.mark.parametrize("scenario", PAPER_SCENARIOS)
+def test_no_traffic_that_the_simulator_has_is_taken_for_a_lie(scenario: str, driver: str):
+    """Where roads are crowded from the start, cars brake as hard as they can and crash into each other."""
+    agent, lanes, worlds = open_agent(f"shipped:{scenario}/{driver}", scenario), get_scenario(scenario).lanes, 100
+    env = make_vec(scenario, worlds, autoreset=False)
+    obs, _ = env.reset(seed=spawn_seeds("tune", worlds))
+    state, own = agent.start(worlds) if agent.has_memory else None, own_start(worlds, 15, lanes)
+    before, alive = np.zeros_like(obs), np.ones(worlds, np.bool_)
+    for _ in range(30):
+        memory = own[:, 1 : 1 + STATE_SIZE]
+        lies = contradicts(*map(torch.from_numpy, (obs, memory, before)), lanes).numpy()
+        assert not (lies & alive).any()
+        action = agent.act(obs, state) if agent.has_memory else agent.act(obs)
+        before, own = obs.copy(), own_next(own, action, lanes)
+        state = moved_on(agent, obs, state, action) if agent.has_memory else None
+        obs, _, terminated, truncated, _ = env.step(action)
+        alive &= ~(terminated | truncated)
+
+
+def test_lies_about_the_others_alone_are_noticed_at_once():
+    agent, worlds = open_agent(SPEC, SCENARIO), 20
+    attack = get_attack("uniform:ego=trusted,radius=0.02", 3)
+    obs, _ = make_vec(SCENARIO, worlds, autoreset=False).reset(seed=spawn_seeds("tune", worlds))
+    seen = attack(None, torch.from_numpy(obs), torch.Generator().manual_seed(0)).numpy()
+    np.testing.assert_array_equal(seen[:, 0], obs[:, 0])
+    assert agent.doubts(seen, agent.start(worlds)).all()
 
 
 def test_a_doubt_lasts_until_the_episode_ends_and_rows_go_to_their_policies(driven: list):

@@ -9,12 +9,12 @@ from rapid.attacks import NAMED, get_attack, parse_attack
 from rapid.attacks.attack import Field, Moment, offers
 from rapid.attacks.directed import ORDERS, reachable
 from rapid.attacks.search import Ball, Runs, own_action
-from rapid.attacks.spec import KINDS
+from rapid.attacks.spec import KINDS, MOVED
 from rapid.config import NetworkConfig
 from rapid.errors import RapidError
 from rapid.networks.encoding import feature_scale
 from rapid.networks.q_network import QNetwork, build_network
-from rapid.scenarios import FASTER, SLOWER
+from rapid.scenarios import FASTER, FEATURES, SLOWER
 
 SCALE = feature_scale(3)
 FEW = {"pgd": "steps=4", "directed": "steps=4", "square": "queries=20", "transfer": "steps=4", "coupled": "steps=4"}
@@ -45,7 +45,8 @@ def texts(tmp_path_factory):
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("world", "adversary")])
 @pytest.mark.parametrize(
-    "options", ["", "presence=free", "ego=trusted", "radius=0.03", "metres=1,speed=0.5", "radius=0"]
+    "options",
+    ["", "presence=free", "ego=trusted", "radius=0.03", "metres=1,speed=0.5", "radius=0", "moves=along", "moves=speed"],
 )
 def test_every_kind_shows_a_point_of_its_ball_and_leaves_the_rest_true(roads, texts, kind, options):
     obs, text = roads(6), texts[kind]
@@ -62,6 +63,10 @@ def test_every_kind_shows_a_point_of_its_ball_and_leaves_the_rest_true(roads, te
         assert torch.equal(seen[..., 0], obs[..., 0])
     if spec.ego == "trusted":
         assert torch.equal(seen[:, 0], obs[:, 0])
+    if spec.moves != "all":
+        stay = [FEATURES.index(feature) for feature in FEATURES if feature not in MOVED[spec.moves]]
+        assert torch.equal(seen[..., stay], obs[..., stay])
+        assert not torch.equal(seen, obs)
     if kind not in ("none", "gaussian"):
         room = torch.tensor(spec.sizes(3)) + 1e-4  # float32 metres far down the road
         assert ((seen - obs).abs() <= room).all()

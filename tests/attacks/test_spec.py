@@ -87,6 +87,10 @@ def test_sizes_are_told_in_metres():
     sensor = parse_attack("pgd:metres=1,speed=0.5,ego=trusted")
     assert sensor.units(3) == "1 m along, 1 m across, 0.5 m/s, the ego's own row true"
     assert sensor.sizes(5) == (1, 1, 1, 0.5, 0.5)
+    shifted = parse_attack("lie:to=near,moves=along,ego=trusted")
+    assert shifted.units(4) == "0.1 (20 m along), the ego's own row true"
+    assert shifted.sizes(4) == pytest.approx((0.1, 20, 0, 0, 0))
+    assert parse_attack("pgd:moves=speed").units(4) == "0.1 (8 m/s)"
     assert NAMED["fgsm"].sizes(4) == pytest.approx((0.1, 20, 1.6, 8, 8))
 
 
@@ -96,6 +100,7 @@ def test_sizes_are_told_in_metres():
         ("fsgm", "did you mean 'fgsm'"),
         ("pgd:lss=ce", "did you mean 'loss'"),
         ("pgd:loss=marge", "did you mean 'margin'"),
+        ("pgd:moves=allong", "did you mean 'along'"),
         ("pgd:radius=-0.1", r"radius is -0\.1.*from 0 to 10"),
         ("pgd:radius=nan", "radius is nan.*finite"),
         ("uniform:radius=inf", "radius is inf.*finite"),

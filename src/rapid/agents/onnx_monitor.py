@@ -10,16 +10,29 @@ import numpy as np
 from rapid.agents.onnx_graph import Graph
 from rapid.agents.onnx_memory import next_state
 from rapid.agents.onnx_network import q_values
-from rapid.defences import CAR_UNITS
 from rapid.errors import RapidError
-from rapid.monitor import BEHIND, BEYOND, CARS, PLACE_ERROR, SPEED_ERROR, MonitoredNetwork
+from rapid.monitor import (
+    ASIDE,
+    ASIDE_SPEED,
+    COMING,
+    CRUISE,
+    FASTER_BY,
+    FIRST_ERROR,
+    FIRST_SPEEDS,
+    OFF_LANE,
+    PLACE_ERROR,
+    SLOWER_BY,
+    SPEED_ERROR,
+    STRAIGHT,
+    STRAY,
+    MonitoredNetwork,
+)
 from rapid.networks.memory import DELAY, DISTANCE, SPEED, START_TOLERANCE, STATE_SIZE, STEPS, start_x
 from rapid.networks.q_network import QNetwork
+from rapid.road import LANE_WIDTH, SIGHT
 from rapid.scenarios import NUM_FEATURES
 
-PRESENCE, X, VX, VY = 0, 1, 3, 4
-NOWHERE = 1e30
-"""How far apart two rows are that do not belong together."""
+PRESENCE, X, Y, VX, VY = range(NUM_FEATURES)
 
 
 def build_monitored_model(network: MonitoredNetwork) -> Any:
@@ -63,9 +76,6 @@ def _contradicts(graph: Graph, memory: str, before: str, lanes: int) -> str:
     def known(index: int) -> str:
         return graph.cut(memory, index, index + 1, 1)
 
-    def feature(rows: str, index: int) -> str:
-        return graph.node("Squeeze", graph.cut(rows, index, index + 1, 2), graph.constant([2], np.int64))
-
     def outside(value: str, least: float | str, most: float | str) -> str:
         return graph.node("Or", graph.node("Less", value, least), graph.node("Greater", value, most))
 
@@ -81,36 +91,114 @@ def _contradicts(graph: Graph, memory: str, before: str, lanes: int) -> str:
         outside(faster, -SPEED_ERROR, SPEED_ERROR),
         outside(graph.cut(ego, X, X + 1, 1), graph.node("Sub", late, room), graph.node("Add", place, room)),
     )
-    there, fast = graph.node("Add", feature(before, X), feature(before, VX)), feature(before, VX)
-    row, belongs = _matched(graph, before)
-    ahead = graph.node("Sub", feature("obs", X), graph.node("GatherElements", there, row, axis=1))
-    quicker = graph.node("Sub", feature("obs", VX), graph.node("GatherElements", fast, row, axis=1))
-    far = graph.node("Or", outside(ahead, -BEHIND[0], BEYOND[0]), outside(quicker, -BEHIND[1], BEYOND[1]))
-    wrong = graph.number(graph.node("And", far, belongs))
-    cars = graph.node("ReduceSum", wrong, graph.constant([1], np.int64), keepdims=1)
-    return graph.node("Or", ego_wrong, graph.node("GreaterOrEqual", cars, float(CARS)))
+    others = _Others(graph, before)
+    return graph.node("Or", graph.node("Or", ego_wrong, others.impossible_sight()), others.impossible_since())
 
 
-def _matched(graph: Graph, before: str) -> tuple[str, str]:
-    """Return for each car seen the nearest that was expected (B, V), and whether they are each other's nearest."""
-    vehicles = graph.vehicles
-    place, speed = graph.cut(before, 1, 3, 2), graph.cut(before, 3, 5, 2)
-    moved = graph.node("Concat", graph.node("Add", place, speed), speed, axis=2)
-    seen = graph.reshape(graph.cut("obs", 1, NUM_FEATURES, 2), -1, vehicles, 1, NUM_FEATURES - 1)
-    apart = graph.node("Sub", seen, graph.reshape(moved, -1, 1, vehicles, NUM_FEATURES - 1))
-    apart = graph.node("Abs", graph.node("Mul", apart, np.array([1 / unit for unit in CAR_UNITS], np.float32)))
-    away = graph.node("ReduceSum", apart, graph.constant([3], np.int64), keepdims=0)
-    present = [
-        graph.reshape(graph.node("Greater", graph.cut(rows, PRESENCE, PRESENCE + 1, 2), 0.5), -1, *shape)
-        for rows, shape in (("obs", (vehicles, 1)), (before, (1, vehicles)))
-    ]
-    # The ego is left out: what is known of it is looked at by itself.
-    others = np.ones((vehicles, vehicles), np.bool_)
-    others[0], others[:, 0] = False, False
-    both = graph.node("And", graph.node("And", *present), graph.constant(others, np.bool_))
-    away = graph.node("Where", both, away, NOWHERE)
-    row = graph.node("ArgMin", away, axis=2, keepdims=0)
-    back = graph.node("GatherElements", graph.node("ArgMin", away, axis=1, keepdims=0), row, axis=1)
-    mutual = graph.node("Equal", back, graph.constant(np.arange(vehicles)[None], np.int64))
-    near = graph.node("Less", graph.node("ReduceMin", away, axes=[2], keepdims=0), NOWHERE / 2)
-    return row, graph.node("And", mutual, near)
+class _Others:
+    """The rules on other cars, each as in :mod:`rapid.monitor`, for what is seen and what was seen before."""
+
+    def __init__(self, graph: Graph, before: str) -> None:
+        self.graph, self.before, self.cars = graph, before, graph.vehicles - 1
+
+    def impossible_sight(self) -> str:
+        """Return whether another car drives as none does (B, 1)."""
+        straight = self._both(self._above(self._seen(VX), CRUISE), self._below(self._aside(), STRAIGHT))
+        between = self._both(straight, self._above(self._off_lane(), OFF_LANE))
+        return self._any_car(
+            self._both(self._here("obs"), self._either(between, self._above(self._aside(), ASIDE_SPEED)))
+        )
+
+    def impossible_since(self) -> str:
+        """Return whether it is where none begins, or where none can be a second later (B, 1)."""
+        ego = self.graph.reshape(self.graph.cut(self.before, 0, 1, 1), -1, NUM_FEATURES)
+        begun = self._above(self.graph.cut(ego, PRESENCE, PRESENCE + 1, 1), 0.5)
+        # onnxruntime has no Where for conditions.
+        first = self._both(self.graph.node("Not", begun), self._impossible_start())
+        return self._either(first, self._both(begun, self._impossible_move()))
+
+    def _impossible_start(self) -> str:
+        speed, (least, most) = self._seen(VX), FIRST_SPEEDS
+        wrong_speed = self._either(self._below(speed, least - FIRST_ERROR), self._above(speed, most + FIRST_ERROR))
+        wrong = self._either(wrong_speed, self._above(self._aside(), FIRST_ERROR))
+        return self._any_car(
+            self._both(self._here("obs"), self._either(wrong, self._above(self._off_lane(), FIRST_ERROR)))
+        )
+
+    def _impossible_move(self) -> str:
+        graph, before = self.graph, self.before
+        here, there = self._here("obs"), self._here(before)
+        expected = graph.node("Add", self._column(before, X), self._column(before, VX))
+        along = graph.node("Sub", self._now(self._seen(X)), self._was(expected))
+        across = graph.node("Sub", self._now(self._seen(Y)), self._was(self._column(before, Y)))
+        faster = graph.node("Sub", self._now(self._seen(VX)), self._was(self._column(before, VX)))
+        least = graph.node("Sub", graph.node("Min", faster, 0.0), STRAY)
+        most = graph.node("Add", graph.node("Max", faster, 0.0), STRAY)
+        possible = self._both(
+            self._within(along, least, most),
+            self._within(faster, -SLOWER_BY, FASTER_BY),
+            self._within(across, -ASIDE, ASIDE),
+            self._now(here),
+            self._was(there),
+        )
+        origin = graph.node("Sub", self._seen(X), self._seen(VX))
+        came = self._both(here, graph.node("Not", self._some(possible, 2)), self._well_in_view(origin, before))
+        went = self._both(there, graph.node("Not", self._some(possible, 1)), self._well_in_view(expected, "obs"))
+        return self._any_car(self._either(came, went))
+
+    def _well_in_view(self, x: str, rows: str) -> str:
+        graph = self.graph
+        ego_x = graph.reshape(graph.cut(graph.cut(rows, 0, 1, 1), X, X + 1, 2), -1, 1)
+        away = graph.node("Abs", graph.node("Sub", self._column(rows, X), ego_x))
+        farthest = graph.node("ReduceMax", away, axes=[1], keepdims=1)
+        some_absent = self._any_car(graph.node("Not", self._here(rows)))
+        edge = graph.node("Sub", graph.node("Where", some_absent, SIGHT, farthest), COMING)
+        return graph.node("Less", graph.node("Abs", graph.node("Sub", x, ego_x)), edge)
+
+    def _off_lane(self) -> str:
+        lane = self.graph.node("Round", self.graph.node("Mul", self._seen(Y), 1 / LANE_WIDTH))
+        return self.graph.node("Abs", self.graph.node("Sub", self._seen(Y), self.graph.node("Mul", lane, LANE_WIDTH)))
+
+    def _aside(self) -> str:
+        return self.graph.node("Abs", self._seen(VY))
+
+    def _seen(self, index: int) -> str:
+        return self._column("obs", index)
+
+    def _column(self, rows: str, index: int) -> str:
+        """Return a feature of every car but the ego (B, V - 1)."""
+        others = self.graph.cut(rows, 1, self.cars + 1, 1)
+        return self.graph.reshape(self.graph.cut(others, index, index + 1, 2), -1, self.cars)
+
+    def _here(self, rows: str) -> str:
+        return self._above(self._column(rows, PRESENCE), 0.5)
+
+    def _now(self, values: str) -> str:
+        return self.graph.reshape(values, -1, self.cars, 1)
+
+    def _was(self, values: str) -> str:
+        return self.graph.reshape(values, -1, 1, self.cars)
+
+    def _above(self, value: str, least: float) -> str:
+        return self.graph.node("Greater", value, least)
+
+    def _below(self, value: str, most: float) -> str:
+        return self.graph.node("Less", value, most)
+
+    def _within(self, value: str, least: str | float, most: str | float) -> str:
+        return self._both(self.graph.node("GreaterOrEqual", value, least), self.graph.node("LessOrEqual", value, most))
+
+    def _both(self, first: str, *others: str) -> str:
+        for other in others:
+            first = self.graph.node("And", first, other)
+        return first
+
+    def _either(self, first: str, second: str) -> str:
+        return self.graph.node("Or", first, second)
+
+    def _some(self, tests: str, axis: int) -> str:
+        axes = self.graph.constant([axis], np.int64)
+        return self._above(self.graph.node("ReduceSum", self.graph.number(tests), axes, keepdims=0), 0.5)
+
+    def _any_car(self, tests: str) -> str:
+        return self.graph.reshape(self._some(tests, 1), -1, 1)

@@ -190,7 +190,7 @@ class Base(ABC):
         elif lanes is None:
             raise RapidError(f"The attack '{self.name}' does not know the road: give get_attack the number of lanes.")
         else:
-            scale_F, radius = feature_scale(lanes), spec.radius
+            scale_F, radius = feature_scale(lanes) * torch.tensor(spec.mask()), spec.radius
         scale_VF = scale_F.repeat(obs_BVF.shape[1], 1)
         if spec.presence == "masked":
             scale_VF[:, 0] = 0

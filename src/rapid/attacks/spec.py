@@ -13,6 +13,7 @@ from urllib.parse import quote, unquote
 
 from rapid.errors import RapidError, did_you_mean
 from rapid.road import RANGES
+from rapid.scenarios import FEATURES
 
 Kind = Literal[
     "none",
@@ -33,6 +34,14 @@ Norm = Literal["linf", "l2"]
 Loss = Literal["ce", "margin", "dlr", "min-q", "mad"]
 Target = Literal["faster", "idle", "sideways", "slower"]
 Lie = Literal["far", "near", "left", "right", "drawn"]
+Moves = Literal["all", "along", "place", "speed"]
+MOVED: dict[Moves, tuple[str, ...]] = {
+    "all": ("x", "y", "vx", "vy"),
+    "along": ("x",),
+    "place": ("x", "y"),
+    "speed": ("vx", "vy"),
+}
+"""The features that an attack may change, beside presence."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +66,9 @@ class AttackSpec:
     """Whether the presence feature may be changed too."""
     ego: Literal["free", "trusted"] = "free"
     """`trusted`: the row of the ego itself stays true (a car knows its own place and speed)."""
+    moves: Moves = "all"
+    """Which features of a car may be changed: all, its place `along` the road, its `place`, or its `speed`. A lie about
+    one alone contradicts the others less, or more."""
     steps: int = 50
     """Gradient steps."""
     step: float = 0.0
@@ -119,15 +131,21 @@ class AttackSpec:
 
     def sizes(self, lanes: int) -> tuple[float, ...]:
         """Return how far each feature may move, in the order of `scenarios.FEATURES`: as it is, m, m, m/s, m/s."""
-        if self.metres or self.speed:
-            return (1.0, self.metres, self.metres, self.speed, self.speed)
         along, across, speed = RANGES
-        return tuple(self.radius * unit for unit in (1.0, along, across * lanes, speed, speed))
+        sizes = tuple(self.radius * unit for unit in (1.0, along, across * lanes, speed, speed))
+        if self.metres or self.speed:
+            sizes = (1.0, self.metres, self.metres, self.speed, self.speed)
+        return tuple(size * moves for size, moves in zip(sizes, self.mask(), strict=True))
+
+    def mask(self) -> tuple[float, ...]:
+        """Return 1 for each feature that `moves` lets change and for presence, as ordered in `scenarios.FEATURES`."""
+        return tuple(float(feature in ("presence", *MOVED[self.moves])) for feature in FEATURES)
 
     def units(self, lanes: int) -> str:
         """Return the size in words: normalised, metres along and across, m/s, and what may move."""
-        _, along, across, speed, _ = self.sizes(lanes)
-        size = f"{along:.3g} m along, {across:.3g} m across, {speed:.3g} m/s"
+        sizes = dict(zip(FEATURES, self.sizes(lanes), strict=True))
+        told = {"x": f"{sizes['x']:.3g} m along", "y": f"{sizes['y']:.3g} m across", "vx": f"{sizes['vx']:.3g} m/s"}
+        size = ", ".join(words for feature, words in told.items() if feature in MOVED[self.moves])
         words = size if self.metres or self.speed else f"{self.radius:g} ({size})"
         if self.presence == "free":
             words += ", presence too"
@@ -160,7 +178,7 @@ class AttackSpec:
         }[self.kind]
 
 
-_SIZE = ("radius", "metres", "speed", "presence", "ego")
+_SIZE = ("radius", "metres", "speed", "presence", "ego", "moves")
 _RUNS = ("steps", "step", "restarts", "start", "norm", *_SIZE)
 _FIELDS: dict[Kind, tuple[str, ...]] = {
     "none": (),
@@ -277,6 +295,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "norm": get_args(Norm),
     "presence": ("masked", "free"),
     "ego": ("free", "trusted"),
+    "moves": get_args(Moves),
     "start": ("clean", "random"),
     "loss": get_args(Loss),
     "keep": ("best", "last"),

@@ -28,6 +28,14 @@ STRONG = (
 SWEPT = ("pgd:loss=margin", "directed:target=faster", "directed:target=idle", "world")
 """Attacks of a sweep over sizes: those that were found to do most."""
 RADII = (0.005, 0.01, 0.02, 0.05, 0.1)
+PLAUSIBLE = (
+    "lie:to=near,moves=along,ego=trusted",
+    "lie:moves=along,ego=trusted",
+    "coupled:coupling=0.1,moves=along,ego=trusted",
+    "pgd:loss=margin,moves=along,ego=trusted",
+    "world:moves=along,ego=trusted",
+)
+"""Lies that contradict nothing else that is seen, or little: other cars are only farther on, or less far."""
 SENSOR = "metres=1,speed=0.5"
 """What a good sensor may be wrong by."""
 
@@ -65,12 +73,18 @@ def _sweep(options: str) -> list[AttackSpec]:
     return [NAMED["none"], *swept]
 
 
+def _plausible(options: str) -> list[AttackSpec]:
+    lies = [parse_attack(text) for text in PLAUSIBLE]
+    return [NAMED["none"], *(with_options(spec, options) if options else spec for spec in lies)]
+
+
 PRESETS: dict[str, Callable[[str], list[AttackSpec]]] = {
     "paper": _paper,
     "suite": suite,
     "sensor": lambda options: suite(f"{SENSOR},{options}" if options else SENSOR),
     "columns": _columns,
     "sweep": _sweep,
+    "plausible": _plausible,
 }
 """Makers of the attacks of a preset; they take options for all of them. `columns` is the suite four times: presence
 masked and free, the ego's own row trusted and not."""

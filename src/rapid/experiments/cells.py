@@ -159,7 +159,7 @@ EPOCH: dict[str, int] = {
     "fresh": 1,
     "distill": 1,
     "adapt": 1,
-    "monitored": 1,
+    "monitored": 2,
     "drive": 1,
     "scenes": 1,
     "decide": 1,
