@@ -27,7 +27,10 @@ from rapid.report.sweep import sweep_figure
 
 FLOORS = ("slower", "immune", "blind")
 """Drivers that no lie about other cars misleads; drawn as squares."""
-COLORS = ("#1f6f8b", "#6b57b8", "#d0672a", "#3c8f4e", "#b33a67", "#8a939b", "#4a525a", "#8b7a2b")
+COLORS = (
+    *("#1f6f8b", "#6b57b8", "#d0672a", "#3c8f4e", "#b33a67", "#8a939b", "#4a525a", "#8b7a2b"),
+    *("#12b5cb", "#e52592", "#7cb342", "#f9ab00"),
+)
 MARKERS = "oD^v"
 """Where colours begin anew, other marks do as well: no two agents look the same."""
 
@@ -90,7 +93,7 @@ def trade_off(rows: Sequence[EpisodeRow]) -> Figure:
     axes.set_xlim(low, high)
     axes.set_ylim(0, high)
     axes.set_xlabel("return without attack")
-    axes.set_ylabel("mean over spawns of the least return under any attack")
+    axes.set_ylabel("mean over spawns of the least return under these attacks")
     axes.set_title(
         f"{rows[0].scenario}; dotted: nothing lost; squares: floors that no lie misleads", fontsize=9, loc="left"
     )

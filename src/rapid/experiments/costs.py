@@ -50,13 +50,14 @@ def rates_table() -> str:
 
 
 def totals_table() -> str:
-    """Return what three large experiments come to, as Markdown, divided evenly among machines."""
+    """Return what large experiments come to, as Markdown, divided evenly among machines."""
     setting = Setting("strong", "full", PAPER_SCENARIOS[0])
-    training = rapid(setting, mixture(setting))
+    data = mixture(setting)
     random = Collect(PAPER_SCENARIOS[0], TeacherConfig(backend="scripted", model="random"), 1)
     wanted = (
-        ("1,000 trainings of RAPID, recipe `strong`", 1e3, _cost(training)),
-        ("10⁶ decisions of the default teacher", 1e6 / EPISODE, (rates().get("drive/teacher/none"), None)),
+        ("1,000 trainings of RAPID, recipe `strong`, its default plan `bold`", 1e3, _cost(rapid(setting, data))),
+        ("1,000 of the plan `ppo`: 300K + 700K steps", 1e3, _cost(rapid(setting, data, plan="ppo"))),
+        ("10⁶ decisions of the default teacher, driving", 1e6 / EPISODE, (rates().get("drive/teacher/none"), None)),
         ("10⁹ transitions of random driving", 1e9, _cost(random)),
     )
     rows: list[tuple[str, ...]] = []

@@ -127,7 +127,7 @@ ALL: dict[str, Exhibit] = {
             show_ratio,
         ),
         offline_table("offline", "Return after phase 2, by scenario, dataset and method.", OFFLINE_COLUMNS),
-        Exhibit("online", "Return while adapting online, in", "figure", online_cells, show_online),
+        Exhibit("online", "Return while adapting online.", "figure", online_cells, show_online),
         comparison(
             "attack",
             "Return under attacks on the observation.",
