@@ -93,7 +93,7 @@ def test_everything_that_the_paper_shows_and_that_is_ours_has_an_id():
         "environment",
         "hyperparameters",
     }
-    assert set(ALL) == paper | {"floors", "teachers", "scores", "progress", "ablations", "robustness"}
+    assert set(ALL) == paper | {"floors", "teachers", "scores", "progress", "ablations", "differences", "robustness"}
     for name in paper:
         assert cells_of(ALL[name], "paper", "full") is not None
         assert cells_of(ALL[name], "strong", "full") is not None

@@ -104,16 +104,24 @@ def _trainings(rows: Sequence[EpisodeRow]) -> int:
     return len({row.training_seed for row in rows})
 
 
+def rows_under(
+    request: Request, store: Store, scenario: str, method: Method, attack: str
+) -> tuple[list[EpisodeRow], str]:
+    """Return a method's episodes under an attack and why any is missing."""
+    seen = method.under(attack)
+    if not seen:
+        return [], "not attacked"
+    old = Legacy(request.recipe, method.id, scenario, seen) if request.scale == "full" else None
+    return rows_of(store, method_drives(request, method, scenario, (seen,)), old)
+
+
 def grid(request: Request, store: Store, scenario: str, method: Method, attacks: Sequence[str]) -> tuple[Entry, ...]:
     """Return one row of a table: a method in a scenario under each attack, beside the paper's numbers."""
     entries: list[Entry] = []
     for name in attacks:
-        driven = method.under(name)
-        cells = method_drives(request, method, scenario, (driven,)) if driven else []
-        old = Legacy(request.recipe, method.id, scenario, driven) if request.scale == "full" else None
-        rows, why = rows_of(store, cells, old)
+        rows, why = rows_under(request, store, scenario, method, name)
         said = paper_result("attack", name, scenario=scenario, method=method.printed) if method.printed else None
-        entries.append(entry(rows, said, why if driven else "not attacked"))
+        entries.append(entry(rows, said, why))
     return tuple(entries)
 
 

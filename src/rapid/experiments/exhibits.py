@@ -6,7 +6,7 @@ from dataclasses import replace
 from rapid.attacks.suite import suite
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.evaluation.worst import worst_rows
-from rapid.experiments import words
+from rapid.experiments import differences, words
 from rapid.experiments.cells import Cell, Drive, key
 from rapid.experiments.exhibit import ATTACKS, Exhibit, Request, Shown, comparison, method_drives, rows_of
 from rapid.experiments.methods import METHODS, Method
@@ -235,7 +235,10 @@ ALL: dict[str, Exhibit] = {
         comparison(
             "progress",
             "RAPID and the floors under the reward `progress`.",
-            ("slower", "immune", "blind", "teacher", "distilled", "online-ppo", "rapid-10k", "rapid-ppo"),
+            (
+                *("slower", "immune", "blind", "teacher", "distilled", "online-ppo", "rapid-10k", "rapid-ppo"),
+                "rapid-monitored",
+            ),
             tuple(f"{scenario}:progress" for scenario in PAPER_SCENARIOS),
             recipes=("strong",),
         ),
@@ -248,6 +251,14 @@ ALL: dict[str, Exhibit] = {
             ),
             PAPER_SCENARIOS[:1],
             recipes=("strong",),
+        ),
+        Exhibit(
+            "differences",
+            "What each part of RAPID adds, and how certain that is.",
+            "table",
+            differences.cells,
+            differences.show,
+            of_paper=False,
         ),
         Exhibit(
             "robustness",

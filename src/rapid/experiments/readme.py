@@ -15,11 +15,10 @@ import numpy as np
 from rapid.errors import RapidError, did_you_mean
 from rapid.evaluation.metrics import EpisodeRow, column
 from rapid.experiments.costs import rates_table, totals_table
-from rapid.experiments.exhibit import Request, method_drives, rows_of
+from rapid.experiments.exhibit import Request, rows_under
 from rapid.experiments.exhibits import ALL
 from rapid.experiments.figures import Lines, Router
 from rapid.experiments.methods import METHODS
-from rapid.experiments.migrate import Legacy
 from rapid.experiments.paper import paper_result
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Table, compact, markdown
@@ -80,12 +79,7 @@ def _ours(store: Store, name: str) -> list[str]:
     """Return a method's cells, from the rows of the recipe `strong`."""
     method, cells = METHODS[name], list[str]()
     for scenario, attack in PLACES:
-        seen = method.under(attack)
-        if not seen:
-            cells.append("–")
-            continue
-        drives = method_drives(Request("strong", "full"), method, scenario, (seen,))
-        rows, _ = rows_of(store, drives, Legacy("strong", name, scenario, seen))
+        rows, _ = rows_under(Request("strong", "full"), store, scenario, method, attack)
         cells.append(_number(rows))
     return cells
 
