@@ -196,8 +196,8 @@ class Adversary:
 
     agent: Annotated[Positional[str], arg(metavar="AGENT")]
     """Directory of the agent, which stays as it is."""
-    scenario: str = Config.scenario
-    """Where it is attacked."""
+    scenario: str = ""
+    """Where it is attacked; by default where the agent was trained."""
     attack: str = "adversary"
     """The ball and the search in it, such as adversary:radius=0.05,ego=trusted (docs/attacks.md)."""
     steps: Positive = EvaluateConfig.adversary_steps

@@ -10,7 +10,7 @@ from rapid.bounds import check_bounds
 from rapid.config import PLANS, RECIPES, SCALES, Config
 from rapid.config_io import apply_overrides, load_toml, validate
 from rapid.errors import RapidError
-from rapid.options import Evaluate, Run, Source
+from rapid.options import Adversary, Evaluate, Run, Source
 from rapid.presets import of_file, preset, without_presets
 from rapid.tool_options import Certify, Play
 from rapid.usage import check_options, short_help
@@ -102,7 +102,7 @@ def _with_options(base: Config, options: Any) -> Config:
         from rapid.agents.open import own_scenario
 
         options = dataclasses.replace(options, scenario=own_scenario(options.agents) or base.scenario)
-    if isinstance(options, Certify) and not options.scenario:
+    if isinstance(options, Adversary | Certify) and not options.scenario:
         from rapid.agents.open import own_scenario
 
         options = dataclasses.replace(options, scenario=own_scenario([options.agent]) or base.scenario)

@@ -218,7 +218,7 @@ def _adversary(options: Adversary, config: Config) -> int:
     from rapid.phases.adversary import train
 
     with _claim(options, config, "adversary", ("*",)) as out:
-        before, after = train(options.agent, options.scenario, options.attack, options.steps, out, options.seed)
+        before, after = train(options.agent, config.scenario, options.attack, options.steps, out, options.seed)
         print(f"The adversary is in {out}; in training the agent's return went from {before:.2f} to {after:.2f}")
     return 0
 

@@ -5,14 +5,17 @@ import numpy as np
 import pytest
 
 import rapid
-from rapid.agents.onnx import OnnxAgent
+from rapid.agents.onnx import OnnxAgent, driven_observations, export_onnx
 from rapid.agents.open import open_agent, own_scenario
 from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, card, listing, shipped_adversaries, shipped_agents
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import evaluate_agent, run_episodes
 from rapid.files import sha256
+from rapid.options import Adversary
+from rapid.parsing import parse
 from rapid.scenarios import PAPER_SCENARIOS
 from rapid.spawns import spawn_seeds
+from rapid.tool_options import Certify
 
 NAMES = shipped_agents()
 
@@ -92,3 +95,13 @@ def test_a_shipped_adversary_attacks_the_agent_that_its_card_names_and_no_other(
         evaluate_agent(other, about["scenario"], seeds, (attack,))
     with pytest.raises(RapidError, match="drives nothing itself"):
         open_agent(f"shipped:{name}", about["scenario"])
+
+
+def test_an_exported_agent_and_an_adversary_s_victim_know_where_they_belong(tmp_path):
+    agent = rapid.load_agent("shipped:lane-4-density-2.5/distilled")
+    seeds = spawn_seeds("tune", 1)
+    export_onnx(agent, tmp_path / "it.onnx", *driven_observations(agent, "lane-4-density-2.5", seeds))
+    assert own_scenario([str(tmp_path / "it.onnx")]) == "lane-4-density-2.5"
+    for words in (["shipped:lane-4-density-2.5/distilled"], [str(tmp_path / "it.onnx")]):
+        for verb, kind in (("adversary", Adversary), ("certify", Certify)):
+            assert parse(verb, {verb: kind}, words)[1].scenario == "lane-4-density-2.5"

@@ -75,3 +75,41 @@ def test_the_command_trains_one_and_says_what_it_cannot_train(agent, tmp_path):
     with pytest.raises(RapidError, match="--steps is 0"):
         train(agent, "lane-3-density-2", "adversary", 0, tmp_path / "no")
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize("spec", ["{}", "shield:0:{}", "smooth:2:{}", "monitored:{},{}"])
+def test_what_was_measured_of_an_agent_is_not_taken_for_another_in_its_place(tmp_path, spec):
+    made = {"name": "tiny", "scenario": "lane-3-density-2"}
+    for seed in (1, 2):
+        save_agent(tmp_path / "agent", build_network(NetworkConfig(kind="mlp", hidden=(16,)), 3, seed), made)
+        request = [config("none"), [spec.format(*[tmp_path / "agent"] * 2)], tmp_path / "out"]
+        if seed == 2:
+            with pytest.raises(RapidError, match="--force"):
+                compare(*request)
+        else:
+            assert compare(*request) == compare(*request)
+
+
+def test_nor_what_was_measured_under_the_attack_of_another_agent(agent, tmp_path):
+    for seed in (1, 2):
+        save_agent(tmp_path / "other", build_network(NetworkConfig(kind="mlp", hidden=(16,)), 3, seed), {"name": "o"})
+        request = [config("none", f"transfer:{tmp_path / 'other'},steps=2"), [agent], tmp_path / "out"]
+        if seed == 2:
+            with pytest.raises(RapidError, match="--force"):
+                compare(*request)
+        else:
+            compare(*request)
+
+
+def test_attacks_that_cannot_be_made_are_named_before_anything_is_driven(agent, tmp_path, capsys):
+    with pytest.raises(RapidError, match="On 'slower' these attacks cannot be made: fgsm, pgd"):
+        compare(config("fgsm", "pgd"), [agent, "slower"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    rows = compare(config("none", "fgsm", "uniform"), [agent, "rule"], tmp_path / "out")
+    assert {row.attack for row in rows if row.agent == "rule"} == {"none", "uniform"}
+    assert "On 'rule' these attacks cannot be made: fgsm." in capsys.readouterr().err
+
+
+def test_a_preset_brings_the_floors_that_are_not_named_already(agent, tmp_path):
+    rows = compare(config("paper"), ["slower", agent], tmp_path / "out")
+    assert list(dict.fromkeys(row.agent for row in rows)) == ["slower", "tiny", "immune", "blind"]

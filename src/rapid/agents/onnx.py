@@ -240,6 +240,7 @@ def export_onnx(
         raise RapidError("There are no observations to compare the exported model on. Give a dataset with transitions.")
     description: dict[str, Any] = {
         "name": agent.name,
+        "scenario": agent.metadata.get("scenario"),
         "lanes": agent.network.lanes,
         "features": FEATURES,
         "actions": ACTIONS,

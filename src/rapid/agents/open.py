@@ -2,6 +2,8 @@
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast, get_args
 
@@ -9,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rapid
-from rapid.agents.saved import load_agent, moved_on, remembers
+from rapid.agents.saved import CONFIG_FILE, load_agent, moved_on, remembers
 from rapid.agents.shipped import agent_folder, is_shipped
 from rapid.defences import is_defence, unwrapped
 from rapid.errors import RapidError, did_you_mean
@@ -136,30 +138,53 @@ def monitored_parts(spec: str) -> tuple[str, str]:
     return calm.strip(), wary.strip()
 
 
+def bare_agents(spec: str) -> list[str]:
+    """Return the agents that `spec` names, without filters, defences and monitors around them."""
+    while (shield := spec.startswith(SHIELD)) or is_defence(spec):
+        spec = spec[len(SHIELD) :].partition(":")[2] if shield else unwrapped(spec).agent
+    if spec.startswith(MONITORED):
+        return [bare for part in monitored_parts(spec) for bare in bare_agents(part)]
+    return [spec]
+
+
+def agent_file(spec: str) -> Path:
+    """Return the file that says what a bare agent is: of a saved one its settings, which name the hash of its weights.
+
+    Of a driver it does not exist.
+    """
+    return agent_folder(spec) / CONFIG_FILE if is_shipped(spec) or Path(spec).is_dir() else Path(spec)
+
+
 def own_scenario(specs: Sequence[str]) -> str:
     """Return the scenario in which the saved agents among `specs` were trained; empty if none of them is saved.
+
+    An ONNX file knows its own too, if RAPID wrote it.
 
     Raises:
         RapidError: they were trained in different ones.
     """
     found: dict[str, str] = {}
-    left = list(specs)
-    while left:
-        spec = left.pop(0)
-        while (shield := spec.startswith(SHIELD)) or is_defence(spec):
-            spec = spec[len(SHIELD) :].partition(":")[2] if shield else unwrapped(spec).agent
-        if spec.startswith(MONITORED):
-            left = [*monitored_parts(spec), *left]
-            continue
-        path = agent_folder(spec) / "config.json"
-        if path.is_file():
-            metadata = read_json(path, "agent").get("metadata", {})
-            if isinstance(metadata, dict) and isinstance(metadata.get("scenario"), str):
-                found.setdefault(metadata["scenario"], spec)
+    for bare in chain.from_iterable(map(bare_agents, specs)):
+        if scenario := _trained_in(bare):
+            found.setdefault(scenario, bare)
     if len(found) > 1:
         told = ", ".join(f"'{spec}' in {scenario}" for scenario, spec in found.items())
         raise RapidError(f"These agents were trained in different scenarios: {told}. Say where with --scenario.")
     return next(iter(found), "")
+
+
+def _trained_in(spec: str) -> str:
+    """Return the scenario that a bare agent was trained in; empty if that is not known."""
+    path, metadata = agent_file(spec), {}
+    if path.suffix == ".onnx" and path.is_file():
+        from rapid.agents.onnx import OnnxAgent
+
+        with suppress(RapidError):  # opening it says what is wrong
+            metadata = OnnxAgent(path).metadata
+    elif path.name == CONFIG_FILE and path.is_file():
+        metadata = read_json(path, "agent").get("metadata", {})
+    scenario = metadata.get("scenario") if isinstance(metadata, dict) else None
+    return scenario if isinstance(scenario, str) else ""
 
 
 def network_agent(spec: str, device: str = "cpu") -> "QAgent":
@@ -224,7 +249,7 @@ def check_road(agent: Any, scenario: str) -> None:
         raise RapidError(
             f"'{getattr(agent, 'name', 'The agent')}' has a memory that knows a road of {known} lanes and where "
             f"episodes begin there, but {scenario} has {lanes}. Drive it on {known} lanes, or let it go on learning "
-            f"with `rapid adapt AGENT --adapt.scenario {scenario} --adapt.steps 0` and steps of PPO."
+            f"with `rapid adapt AGENT --scenario {scenario} --steps 0` and steps of PPO."
         )
     own = getattr(agent, "shielded_lanes", None)
     if own is not None and own != lanes:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from rapid.agents.open import PLANNERS, check_road, open_agent
+from rapid.agents.open import PLANNERS, agent_file, bare_agents, check_road, open_agent
 from rapid.agents.q_agent import QAgent
 from rapid.attacks import get_attack
 from rapid.attacks.adversary import fingerprint, save_adversary, train_adversary
@@ -76,25 +76,26 @@ def compare(
     specs = list(dict.fromkeys(specs))
     # Opened once: a language model takes long to load, and as much memory again.
     opened = {spec: _open(config, spec, config.scenario) for spec in specs}
-    names = [_checked_name(config, opened[spec]) for spec in specs]
+    names = [_checked_name(config, spec, opened[spec]) for spec in specs]
     # Two trainings of the same name would fall into one row of the table.
     labels = {spec: f"{name} ({spec})" for spec, name in zip(specs, names, strict=True) if names.count(name) > 1}
-    files = [Path(spec) / "config.json" if Path(spec).is_dir() else Path(spec) for spec in specs]
     settings = to_dict(without_place(config).evaluate)
     request = {
         "threads": config.threads,
-        "agents": [[spec, sha256(file) if file.is_file() else ""] for spec, file in zip(specs, files, strict=True)],
+        "agents": [[spec, _digest(spec)] for spec in specs],
         "teacher": to_dict(config.teacher) if TEACHER in specs else None,
         "scenario": config.scenario,
         "simulator": config.simulator,
         "seed": config.seed,
         "evaluate": {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()},
     }
+    if sources := {each.source: _digest(each.source) for each in expand(config.evaluate.attacks) if each.source}:
+        request["attackers"] = sources
     with ExitStack() as held:
         place = Path(out or held.enter_context(tempfile.TemporaryDirectory(prefix="rapid-")))
         held.enter_context(claimed(place, request, EVALUATION, force=force, keep=map(Path, specs)))
-        if set(specs).isdisjoint(FLOORS) and any(text.partition(":")[0] in PRESETS for text in config.evaluate.attacks):
-            floors = floors_under_attack(config.scenario)
+        if any(text.partition(":")[0] in PRESETS for text in config.evaluate.attacks):
+            floors = [floor for floor in floors_under_attack(config.scenario) if floor not in specs]
             opened |= {spec: _open(config, spec, config.scenario) for spec in floors}
             specs = [*specs, *floors]
         rows = measure(config, config.scenario, specs, place, labels, opened)
@@ -120,15 +121,31 @@ def compare(
     return rows
 
 
-def _checked_name(config: Config, agent: Any) -> str:
-    """Return the name of an agent on which all attacks can be made that need what it has.
+def _digest(spec: str) -> str:
+    """Return what tells the agents that `spec` names from others in their place; empty for drivers without a file."""
+    files = [agent_file(bare) for bare in bare_agents(spec)]
+    return "+".join(sha256(file) for file in files if file.is_file())
+
+
+def _checked_name(config: Config, spec: str, agent: Any) -> str:
+    """Return the name of an agent on which all attacks can be made that need what it has; say which cannot be made.
 
     Raises:
-        RapidError: an attack was made for another agent.
+        RapidError: an attack was made for another agent, or none of them can be made.
     """
-    for each in expand(config.evaluate.attacks):
+    attacks = expand(config.evaluate.attacks if spec != TEACHER else config.evaluate.teacher_attacks)
+    for each in attacks:
         if each.source and (attack := get_attack(each, get_scenario(config.scenario).lanes)).needs in offers(agent):
             attack.check(agent)
+    lacking = [each.shown for each in attacks if not is_applicable(agent, each)]
+    said = (
+        f"On '{agent.name}' these attacks cannot be made: {', '.join(lacking)}. They need a network, Q-values, or one "
+        "who sees observations (docs/attacks.md)."
+    )
+    if lacking and len(lacking) == len(attacks):
+        raise RapidError(f"{said} Give others, such as uniform, gaussian or lie.")
+    if lacking:
+        warn(said)
     return str(agent.name)
 
 
