@@ -131,7 +131,17 @@ ALL: dict[str, Exhibit] = {
         comparison(
             "attack",
             "Return under attacks on the observation.",
-            ("online-dqn", "offline-dqn", "rapid-without-robust", "rapid", "slower", "immune", "blind"),
+            (
+                "online-dqn",
+                "offline-dqn",
+                "rapid-without-robust",
+                "rapid",
+                "slower",
+                "immune",
+                "blind",
+                "random",
+                "rule",
+            ),
             of_paper=True,
         ),
         Exhibit(
@@ -217,7 +227,8 @@ ALL: dict[str, Exhibit] = {
             "scores",
             "RAPID, its baselines and the floors under the paper's reward.",
             (
-                *("slower", "immune", "blind", "teacher", "offline-dqn", "offline-ddqn", "cql", "bc", "distilled"),
+                *("slower", "immune", "blind", "random", "rule", "teacher", "planner"),
+                *("offline-dqn", "offline-ddqn", "cql", "bc", "distilled"),
                 *(
                     "online-ddqn-10k",
                     "online-ppo",
