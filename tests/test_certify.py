@@ -268,7 +268,7 @@ def test_the_verb_writes_what_it_has_proven_and_refuses_the_rest_first(tmp_path:
     for words, said in (
         ((str(tmp_path / "agent"), "--radii", "0.001", "0.6"), "radi"),
         ((str(tmp_path / "agent"), "--spawns", "2", "--returns", "3"), "Ask for more"),
-        (("slower",), "no agent"),
+        (("slower",), "no saved agent"),
         ((str(tmp_path / "agent"), "--scenario", f"{SCENARIO}:progress", "--returns", "1"), "never negative"),
     ):
         assert call(*words) == 2

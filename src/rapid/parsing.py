@@ -99,11 +99,11 @@ def _with_options(base: Config, options: Any) -> Config:
     if isinstance(options, Run):
         return validate(options.settings)
     if isinstance(options, Evaluate) and not options.scenario:
-        from rapid.agents.open import own_scenario
+        from rapid.agents.specs import own_scenario
 
         options = dataclasses.replace(options, scenario=own_scenario(options.agents) or base.scenario)
     if isinstance(options, Adversary | Certify) and not options.scenario:
-        from rapid.agents.open import own_scenario
+        from rapid.agents.specs import own_scenario
 
         options = dataclasses.replace(options, scenario=own_scenario([options.agent]) or base.scenario)
     if isinstance(options, Play) and not options.scenario:

@@ -69,7 +69,8 @@ def export(options: Export, config: Config) -> int:
     import torch
 
     from rapid.agents.onnx import driven_observations, export_onnx, latency
-    from rapid.agents.open import MONITORED, exportable_agent
+    from rapid.agents.open import exportable_agent
+    from rapid.agents.specs import MONITORED
     from rapid.data.batch import with_rows
     from rapid.data.dataset import load_dataset
     from rapid.spawns import spawn_seeds

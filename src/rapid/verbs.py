@@ -168,15 +168,19 @@ def _claim(options: Any, config: Config, usual: str, makes: Sequence[str]) -> Ge
 
 def _content(name: str, path: str) -> str:
     """Return the hash of a dataset or an agent, whose records name those of their files."""
-    from rapid.agents.shipped import agent_folder
+    from rapid.agents.specs import digest
     from rapid.data.shipped import dataset_folder
     from rapid.files import sha256
 
-    folder = agent_folder(path) if name == "agent" else dataset_folder(path)
-    for record in (folder / "dataset.json", folder / "config.json", folder):
+    if name == "agent":
+        if found := digest(path):
+            return found
+        raise RapidError(f"There is no saved agent at '{path}'. Check the path, or make it first.")
+    folder = dataset_folder(path)
+    for record in (folder / "dataset.json", folder):
         if record.is_file():
             return sha256(record)
-    raise RapidError(f"There is neither a dataset nor an agent at '{path}'. Check the path, or make it first.")
+    raise RapidError(f"There is no dataset at '{path}'. Check the path, or make it first.")
 
 
 def _distill(options: Distill, config: Config) -> int:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from rapid.agents.open import check_road, network_agent, open_agent, own_scenario
+from rapid.agents.open import check_road, network_agent, open_agent
 from rapid.agents.saved import moved_on
+from rapid.agents.specs import own_scenario
 from rapid.attacks import get_attack
 from rapid.attacks.attack import offers, values_of
 from rapid.defences import Smoothing, TrackFilter, fitted, make_defence, matched, unwrapped

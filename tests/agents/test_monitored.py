@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from rapid import hub
 from rapid.agents.monitored import MonitoredAgent, load_monitored, save_monitored
 from rapid.agents.onnx import OnnxAgent, driven_observations, export_onnx
-from rapid.agents.open import check_road, exportable_agent, monitored_parts, network_agent, open_agent, own_scenario
+from rapid.agents.open import check_road, exportable_agent, network_agent, open_agent
 from rapid.agents.saved import CONFIG_FILE, load_agent, moved_on
+from rapid.agents.specs import monitored_parts, own_scenario
 from rapid.attacks import get_attack
 from rapid.attacks.attack import values_of
 from rapid.errors import RapidError

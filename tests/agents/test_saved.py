@@ -81,7 +81,7 @@ def test_observations_that_do_not_fit_are_refused(roads):
 
 
 def test_missing_agents(tmp_path, saved):
-    with pytest.raises(RapidError, match="no agent"):
+    with pytest.raises(RapidError, match="no saved agent"):
         load_agent(tmp_path / "nowhere")
     (saved / "weights.safetensors").unlink()
     with pytest.raises(RapidError, match=r"no weights\.safetensors"):

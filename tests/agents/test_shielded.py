@@ -149,7 +149,7 @@ def test_specs_and_settings_that_make_no_sense_are_refused(tmp_path):
             open_agent(spec, SCENARIO)
     with pytest.raises(RapidError, match="no agent 'nobody'"):
         open_agent("shield:0.1:nobody", SCENARIO)
-    with pytest.raises(RapidError, match="no agent"):
+    with pytest.raises(RapidError, match="no saved agent"):
         network_agent("shield:0.1:slower")
     config = Config()
     for section in ("network", "adapt"):

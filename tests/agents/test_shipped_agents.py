@@ -6,8 +6,9 @@ import pytest
 
 import rapid
 from rapid.agents.onnx import OnnxAgent, driven_observations, export_onnx
-from rapid.agents.open import open_agent, own_scenario
+from rapid.agents.open import open_agent
 from rapid.agents.shipped import CARD_FILE, ONNX_FILE, agent_folder, card, listing, shipped_adversaries, shipped_agents
+from rapid.agents.specs import own_scenario
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import evaluate_agent, run_episodes
 from rapid.files import sha256

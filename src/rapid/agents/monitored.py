@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rapid.agents import saved
-from rapid.agents.open import MONITORED, check_road
+from rapid.agents.open import check_road
 from rapid.agents.q_agent import QAgent, check_observations
 from rapid.agents.saved import CONFIG_FILE, MONITORED_FORMAT, WEIGHTS_FILE, noticed, remembers
 from rapid.agents.shipped import agent_folder
+from rapid.agents.specs import MONITORED
 from rapid.agents.watchable import Watchable
 from rapid.attacks.attack import network_of
 from rapid.errors import RapidError

@@ -145,6 +145,11 @@ def load_agent(directory: str | os.PathLike[str], device: str = "cpu") -> QAgent
         RapidError: there is no agent, or it is damaged, of another version, or does not fit this program.
     """
     folder = agent_folder(directory)
+    if not (folder / CONFIG_FILE).is_file():
+        raise RapidError(
+            f"There is no saved agent at '{directory}'. Wanted is a directory that `rapid distill` or `rapid adapt` "
+            "wrote, or shipped:NAME (`rapid agents list`). Drivers by name and ONNX files have no network for this."
+        )
     config = files.read_json(folder / CONFIG_FILE, "agent")
     if isinstance(config, dict) and config.get("format") == MONITORED_FORMAT:
         raise RapidError(

@@ -169,7 +169,7 @@ def import_sb3(path: str | os.PathLike[str], out: str | os.PathLike[str], traine
     model = _build(onnx, policy, looks)
     description = {
         "name": Path(path).stem,
-        "scenario": trained_on if isinstance(task, Scenario) else None,
+        "scenario": trained_on if type(task) is Scenario else None,
         "lanes": task.lanes,
         "features": FEATURES,
         "actions": ACTIONS,

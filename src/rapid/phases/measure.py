@@ -10,8 +10,9 @@ from typing import Any
 
 import torch
 
-from rapid.agents.open import PLANNERS, agent_file, bare_agents, check_road, open_agent
+from rapid.agents.open import PLANNERS, check_road, open_agent
 from rapid.agents.q_agent import QAgent
+from rapid.agents.specs import digest
 from rapid.attacks import get_attack
 from rapid.attacks.adversary import fingerprint, save_adversary, train_adversary
 from rapid.attacks.attack import offers
@@ -26,7 +27,7 @@ from rapid.evaluation.recording import Recording, explained_by, load_recordings,
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
 from rapid.evaluation.summary import summary_text
 from rapid.evaluation.worst import worst_text
-from rapid.files import sha256, write_text
+from rapid.files import write_text
 from rapid.networks.q_network import QNetwork
 from rapid.outputs import EVALUATION, claimed
 from rapid.phases.checks import check
@@ -82,14 +83,14 @@ def compare(
     settings = to_dict(without_place(config).evaluate)
     request = {
         "threads": config.threads,
-        "agents": [[spec, _digest(spec)] for spec in specs],
+        "agents": [[spec, digest(spec)] for spec in specs],
         "teacher": to_dict(config.teacher) if TEACHER in specs else None,
         "scenario": config.scenario,
         "simulator": config.simulator,
         "seed": config.seed,
         "evaluate": {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()},
     }
-    if sources := {each.source: _digest(each.source) for each in expand(config.evaluate.attacks) if each.source}:
+    if sources := {each.source: digest(each.source) for each in expand(config.evaluate.attacks) if each.source}:
         request["attackers"] = sources
     with ExitStack() as held:
         place = Path(out or held.enter_context(tempfile.TemporaryDirectory(prefix="rapid-")))
@@ -119,12 +120,6 @@ def compare(
                 else "Nothing was kept; --out DIRECTORY keeps rows, plot and page."
             )
     return rows
-
-
-def _digest(spec: str) -> str:
-    """Return what tells the agents that `spec` names from others in their place; empty for drivers without a file."""
-    files = [agent_file(bare) for bare in bare_agents(spec)]
-    return "+".join(sha256(file) for file in files if file.is_file())
 
 
 def _checked_name(config: Config, spec: str, agent: Any) -> str:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rapid.agents.open import check_road, open_agent, own_scenario
+from rapid.agents.open import check_road, open_agent
+from rapid.agents.specs import own_scenario
 from rapid.attacks.spec import parse_attack
 from rapid.errors import RapidError
 from rapid.evaluation.rollouts import is_applicable
