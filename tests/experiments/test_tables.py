@@ -76,6 +76,14 @@ def test_tables_are_written_in_every_form_with_what_is_missing():
     assert "not driven" in html
 
 
+def test_what_is_missing_of_a_cell_stands_beside_its_numbers_in_every_form():
+    partial = entry(rows(20, 3), PaperResult(30, 1), "2 of 5 parts are missing")
+    table = replace(TABLE, rows=((("lane-3", "RAPID"), (partial, entry(rows(20, 5)))),))
+    for form in (tables.text, tables.markdown, tables.latex, tables.html):
+        assert form(table).count("2 of 5 parts are missing") == 1
+    assert "missing" not in tables.short(partial)  # README's rows say how many trainings they have
+
+
 def test_the_page_says_in_words_what_reproduces():
     table = replace(TABLE, rows=((("lane-3", "RAPID"), (entry(rows(20, 5), PaperResult(30, 1)), Entry())),))
     (sentence,) = verdicts(ALL["attack"], [table])

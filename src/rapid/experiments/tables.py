@@ -29,7 +29,7 @@ class Entry:
     crash: Estimate | None = None
     printed: PaperResult | None = None
     failed: str = ""
-    """Why there is nothing."""
+    """Why there is nothing, or less than there should be."""
 
     @property
     def iqm(self) -> Estimate | None:
@@ -60,6 +60,7 @@ def entry(rows: Sequence[EpisodeRow], printed: PaperResult | None = None, failed
         lambda: estimate(returns, spawns, seeds, statistic="iqm"),
         estimate(crashes, spawns, seeds),
         printed,
+        failed,
     )
 
 
@@ -93,7 +94,7 @@ class Facts:
 
 
 def ours(each: Entry) -> str:
-    """Return our mean with its interval, the IQM and the number of trainings or spawns."""
+    """Return our mean with its interval, the IQM, the number of trainings or spawns, and what of them is missing."""
     if each.mean is None:
         return f"– ({each.failed})" if each.failed else "–"
     mean = each.mean
@@ -102,7 +103,8 @@ def ours(each: Entry) -> str:
     middle = "" if iqm is None else f", IQM {iqm.value:.1f}"
     crash = "" if each.crash is None else f", crash {each.crash.value:.2f}"
     count = f"{mean.training_seeds}×{mean.spawns}" if mean.training_seeds else f"{mean.spawns}"
-    return f"{mean.value:.1f}{span}{middle}{crash} ({count})"
+    gap = f"; {each.failed}" if each.failed else ""
+    return f"{mean.value:.1f}{span}{middle}{crash} ({count}{gap})"
 
 
 def printed(each: Entry) -> str:
@@ -264,4 +266,6 @@ def _html_entry(each: Entry) -> Markup:
         parts.append(tag("small", f"paper {printed(each)}", class_="line paper"))
         word = each.verdict if each.verdict != "insufficient" else f"{mean.training_seeds} of {ENOUGH_SEEDS} seeds"
         parts.append(tag("small", f"{_MARKS[each.verdict]} {word}", class_=f"line verdict {each.verdict}"))
+    if each.failed:
+        parts.append(tag("small", each.failed, class_="line gap"))
     return tag("td", *parts, title=mean.unit)
