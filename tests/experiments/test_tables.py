@@ -9,7 +9,7 @@ from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import readme, tables
 from rapid.experiments.exhibit import Request, method_drives, rows_of
-from rapid.experiments.exhibits import ALL
+from rapid.experiments.exhibits import ALL, worst_entry
 from rapid.experiments.figures import Curve, Lines, Point, Router, save
 from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
@@ -46,6 +46,19 @@ def rows(mean: float, seeds: int, spawns: int = 20) -> list[EpisodeRow]:
 )
 def test_a_verdict_needs_five_trainings_and_an_interval(mean: float, seeds: int, printed: float, verdict: str):
     assert entry(rows(mean, seeds), PaperResult(printed, 3.0)).verdict == verdict
+
+
+def test_the_worst_case_counts_only_trainings_that_met_every_attack():
+    strong = [replace(row, agent="of before cells") for row in rows(5, 3)]
+    each = worst_entry({"none": (rows(20, 5), ""), "world": (strong, "2 of 5 parts are missing")})
+    assert each.mean is not None
+    assert each.mean.value == pytest.approx(5)  # never the 20 of trainings that were not attacked
+    assert (each.mean.training_seeds, each.mean.episodes) == (3, 60)
+    assert each.failed == "world: 2 of 5 parts are missing"
+    nobody = worst_entry({"none": (rows(20, 1), ""), "world": ([], "5 of 5 parts are missing")})
+    assert (nobody.mean, nobody.failed) == (None, "world: 5 of 5 parts are missing")
+    apart = {"none": (rows(20, 1), ""), "world": ([replace(row, training_seed=1) for row in rows(5, 1)], "")}
+    assert worst_entry(apart).failed == "no training met every attack"
 
 
 def test_no_numbers_of_the_paper_are_no_verdict():
