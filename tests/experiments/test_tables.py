@@ -97,6 +97,20 @@ def test_what_is_missing_of_a_cell_stands_beside_its_numbers_in_every_form():
     assert "missing" not in tables.short(partial)  # README's rows say how many trainings they have
 
 
+def test_every_form_shows_both_means_with_intervals_and_of_how_many_episodes():
+    found = entry(rows(20, 5))
+    untrained = entry([replace(row, training_seed=None) for row in rows(20, 1)])
+    assert found.iqm is not None
+    assert found.iqm is found.iqm  # made once: its interval is slow
+    interval = f"IQM {found.iqm.value:.1f} [{found.iqm.low:.1f}, {found.iqm.high:.1f}]"
+    table = replace(TABLE, rows=((("lane-3", "RAPID"), (found, untrained)),))
+    for form in (tables.text, tables.markdown, tables.latex, tables.html):
+        assert interval in form(table)
+    html = tables.html(table)
+    assert ">5×20<" in html
+    assert ">20 spawns<" in html
+
+
 def test_the_page_says_in_words_what_reproduces():
     table = replace(TABLE, rows=((("lane-3", "RAPID"), (entry(rows(20, 5), PaperResult(30, 1)), Entry())),))
     (sentence,) = verdicts(ALL["attack"], [table])

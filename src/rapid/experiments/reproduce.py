@@ -168,9 +168,9 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
             tag("h1", "The paper, reproduced"),
             tag(
                 "p",
-                f"Recipe {of.recipe}, scale {of.scale}. Ours: mean with 95 % interval, interquartile mean (IQM) and "
-                "crash share; the paper's number as printed. ≈ the paper's mean lies in our interval; ▲ our interval "
-                "lies above it; ▼ below it; fewer than five trainings are no verdict.",
+                f"Recipe {of.recipe}, scale {of.scale}. Ours: mean and interquartile mean (IQM) with 95 % intervals, "
+                "crash share, and trainings × spawns; the paper's number as printed. ≈ the paper's mean lies in our "
+                "interval; ▲ our interval lies above it; ▼ below it; fewer than five trainings are no verdict.",
             ),
             tag("h2", "What reproduces, and what does not"),
             tag("ul", *summary) if summary else tag("p", "Nothing here has numbers of the paper beside it."),

@@ -6,6 +6,7 @@ A verdict is given where at least five trainings were driven: `inside` where the
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,8 @@ from rapid.evaluation.summary import aligned
 from rapid.experiments.paper import PaperResult
 from rapid.pages.markup import Markup, join, tag
 
+IQM_RESAMPLES = 1_000
+"""Of the bootstrap behind the interval of an interquartile mean: a page has hundreds of them, and each sorts."""
 Verdict = Literal["inside", "above", "below", "insufficient", ""]
 
 
@@ -25,15 +28,15 @@ class Entry:
 
     mean: Estimate | None = None
     iqm_of: Callable[[], Estimate] | None = None
-    """Makes the interquartile mean; its interval takes as long as the others together, and few tables show it."""
+    """Makes the interquartile mean; its interval takes as long as the others together, and README shows none."""
     crash: Estimate | None = None
     printed: PaperResult | None = None
     failed: str = ""
     """Why there is nothing, or less than there should be."""
 
-    @property
+    @cached_property
     def iqm(self) -> Estimate | None:
-        """The interquartile mean."""
+        """The interquartile mean, made once for all forms of a table."""
         return self.iqm_of() if self.iqm_of else None
 
     @property
@@ -57,7 +60,7 @@ def entry(rows: Sequence[EpisodeRow], printed: PaperResult | None = None, failed
     returns, crashes = column(rows, "episode_return"), column(rows, "crashed")
     return Entry(
         estimate(returns, spawns, seeds),
-        lambda: estimate(returns, spawns, seeds, statistic="iqm"),
+        lambda: estimate(returns, spawns, seeds, statistic="iqm", resamples=IQM_RESAMPLES),
         estimate(crashes, spawns, seeds),
         printed,
         failed,
@@ -97,14 +100,20 @@ def ours(each: Entry) -> str:
     """Return our mean with its interval, the IQM, the number of trainings or spawns, and what of them is missing."""
     if each.mean is None:
         return f"– ({each.failed})" if each.failed else "–"
-    mean = each.mean
-    span = "" if np.isnan(mean.low) else f" [{mean.low:.1f}, {mean.high:.1f}]"
-    iqm = each.iqm
-    middle = "" if iqm is None else f", IQM {iqm.value:.1f}"
+    middle = "" if each.iqm is None else f", IQM {each.iqm.value:.1f}{span(each.iqm)}"
     crash = "" if each.crash is None else f", crash {each.crash.value:.2f}"
-    count = f"{mean.training_seeds}×{mean.spawns}" if mean.training_seeds else f"{mean.spawns}"
     gap = f"; {each.failed}" if each.failed else ""
-    return f"{mean.value:.1f}{span}{middle}{crash} ({count}{gap})"
+    return f"{each.mean.value:.1f}{span(each.mean)}{middle}{crash} ({count(each.mean)}{gap})"
+
+
+def span(found: Estimate) -> str:
+    """Return an interval in brackets after a space; empty where there is none."""
+    return "" if np.isnan(found.low) else f" [{found.low:.1f}, {found.high:.1f}]"
+
+
+def count(found: Estimate) -> str:
+    """Return trainings × spawns, or only the spawns of what was never trained."""
+    return f"{found.training_seeds}×{found.spawns}" if found.training_seeds else f"{found.spawns}"
 
 
 def printed(each: Entry) -> str:
@@ -152,15 +161,14 @@ def short(each: Entry) -> str:
     said = "" if each.printed is None else f" *{each.printed.mean:.1f}*"
     if each.mean is None:
         return f"–{said}"
-    span = "" if np.isnan(each.mean.low) else f" [{each.mean.low:.1f}, {each.mean.high:.1f}]"
     crash = "" if each.crash is None else f" ({each.crash.value:.2f})".replace("(0.", "(.")
-    return f"{each.mean.value:.1f}{span}{crash}{said}"
+    return f"{each.mean.value:.1f}{span(each.mean)}{crash}{said}"
 
 
 def _few(entries: Sequence[Entry]) -> str:
     """Return how many trainings a row has, where they are too few for a verdict."""
-    count = max(each.mean.training_seeds for each in entries if each.mean is not None)
-    return f"({count} training{'s' if count > 1 else ''})" if 0 < count < ENOUGH_SEEDS else ""
+    most = max(each.mean.training_seeds for each in entries if each.mean is not None)
+    return f"({most} training{'s' if most > 1 else ''})" if 0 < most < ENOUGH_SEEDS else ""
 
 
 def compact(table: Table) -> str:
@@ -255,13 +263,12 @@ def _html_entry(each: Entry) -> Markup:
     if each.mean is None:
         return tag("td", "–", tag("small", each.failed), class_="missing")
     mean = each.mean
-    parts: list[Markup] = [tag("b", f"{mean.value:.1f}")]
-    if not np.isnan(mean.low):
-        parts.append(tag("small", f" [{mean.low:.1f}, {mean.high:.1f}]"))
+    parts: list[Markup] = [tag("b", f"{mean.value:.1f}"), tag("small", span(mean))]
     if each.iqm is not None:
-        parts.append(tag("small", f"IQM {each.iqm.value:.1f}", class_="line"))
+        parts.append(tag("small", f"IQM {each.iqm.value:.1f}{span(each.iqm)}", class_="line"))
     if each.crash is not None:
         parts.append(tag("small", f"crash {each.crash.value:.2f}", class_="line"))
+    parts.append(tag("small", f"{count(mean)}{'' if mean.training_seeds else ' spawns'}", class_="line"))
     if each.printed is not None:
         parts.append(tag("small", f"paper {printed(each)}", class_="line paper"))
         word = each.verdict if each.verdict != "insufficient" else f"{mean.training_seeds} of {ENOUGH_SEEDS} seeds"

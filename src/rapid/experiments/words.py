@@ -13,7 +13,7 @@ from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 DATASETS = {"random": "random (D_rand)", "llm": "teacher (D_LLM)", "mixed": "mixed (D*)"}
 READING = (
     "Random and teacher data are of the row's own scenario; D* is of lane-3-density-2 for every row, as in the paper. "
-    "Each cell: mean [95 % interval], interquartile mean, crash share, trainings × spawns; the paper's; verdict."
+    "Each cell: mean and interquartile mean with 95 % intervals, crash share, trainings × spawns; the paper's; verdict."
 )
 
 
