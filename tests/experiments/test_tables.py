@@ -8,9 +8,9 @@ import pytest
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import readme, tables
-from rapid.experiments.exhibit import Request, method_drives, rows_of
+from rapid.experiments.exhibit import Request, Shown, method_drives, rows_of
 from rapid.experiments.exhibits import ALL, worst_entry
-from rapid.experiments.figures import Curve, Lines, Point, Router, save
+from rapid.experiments.figures import Curve, Lines, Point, Router, draw, save
 from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
 from rapid.experiments.paper import PaperResult
@@ -171,6 +171,32 @@ def test_a_page_of_nothing_says_what_is_missing(tmp_path: Path, monkeypatch: pyt
     assert "KinematicsObservation" in page
     assert (tmp_path / "page" / "tables" / "attack.tex").exists()
     assert (tmp_path / "page" / "figures" / "ratio.svg").exists()
+
+
+def test_no_figure_and_no_table_of_words_hides_that_parts_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    store = Store(tmp_path / "store")
+    for exhibit in ALL.values():
+        request = Request(exhibit.recipes[0], "tiny")
+        for shown in exhibit.show(request, store, exhibit) if exhibit.cells(request) else ():
+            if isinstance(shown, Table):
+                continue  # says so in each of its cells
+            assert "othing has been computed yet: " in _notes(shown) or "are missing" in _notes(shown), exhibit.id
+            assert isinstance(shown, Facts) or not shown.complete
+    request = Request("paper", "tiny")
+    (ratio,) = ALL["ratio"].show(request, store, ALL["ratio"])
+    count = len(ALL["ratio"].cells(request))
+    assert _notes(ratio) == f"Nothing has been computed yet: {count} parts."
+    first = ALL["ratio"].cells(request)[0]
+    monkeypatch.setattr(store, "is_done", lambda cell: cell == first)
+    monkeypatch.setattr(store, "rows", lambda cell: rows(20, 1))
+    (ratio,) = ALL["ratio"].show(request, store, ALL["ratio"])
+    assert _notes(ratio) == f"{count - 1} of {count} parts are missing."
+    assert isinstance(ratio, Lines)
+    assert draw(ratio).axes[0].get_title("right") == f"{count - 1} of {count} parts are missing"
+
+
+def _notes(shown: Shown) -> str:
+    return " ".join((shown.data() if isinstance(shown, Lines | Router) else shown).notes)
 
 
 def test_words_are_those_of_the_presets():

@@ -15,7 +15,7 @@ from rapid.experiments import tables
 from rapid.experiments.cells import Cell, key
 from rapid.experiments.exhibit import Exhibit, Request, Shown
 from rapid.experiments.exhibits import ALL, cells_of, recipe_of
-from rapid.experiments.figures import Lines, Router, save
+from rapid.experiments.figures import Lines, Router, said, save
 from rapid.experiments.graph import Outcome, plan, run
 from rapid.experiments.learned import EFFORTS
 from rapid.experiments.store import Store
@@ -200,7 +200,14 @@ def _block(shown: Shown, out: Path) -> Markup:
         return tag(
             "figure",
             Markup(f'<img alt="{tables_text(facts)}" src="data:image/png;base64,{picture}">'),
-            tag("figcaption", shown.caption, " ", links),
+            tag(
+                "figcaption",
+                shown.caption,
+                " ",
+                tag("b", said(shown.gap), class_="gap") if shown.gap else "",
+                " ",
+                links,
+            ),
             tag("details", tag("summary", "The numbers"), tables.html(facts)),
         )
     write_text(out / "tables" / f"{shown.id}.md", tables.markdown(shown) + "\n")

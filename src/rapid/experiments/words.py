@@ -34,8 +34,8 @@ def number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def efficiency(caption: str, found: Sequence[Mapping[str, Any]]) -> Facts:
-    """Return seconds per decision as a table."""
+def efficiency(caption: str, found: Sequence[Mapping[str, Any]], gap: str = "") -> Facts:
+    """Return seconds per decision as a table, and below it what is missing."""
     rows = tuple(
         (
             str(each["agent"]),
@@ -50,6 +50,8 @@ def efficiency(caption: str, found: Sequence[Mapping[str, Any]]) -> Facts:
     if len(rows) > 1:
         slow, fast = (each["median_seconds"] for each in found)
         notes.append(f"The first takes {slow / fast:.0f} times as long as the second.")
+    if gap:
+        notes.append(gap)
     return Facts("efficiency", caption, ("driver", "median", "mean", "decisions"), rows, tuple(notes))
 
 
