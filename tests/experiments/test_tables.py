@@ -17,6 +17,7 @@ from rapid.experiments.paper import PaperResult
 from rapid.experiments.reproduce import listing, open_reproduction, verdicts, write_page
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Entry, Facts, Table, entry
+from rapid.files import write_json
 
 RESULTS = Path(__file__).parents[2] / "results"
 
@@ -197,6 +198,36 @@ def test_no_figure_and_no_table_of_words_hides_that_parts_are_missing(tmp_path: 
 
 def _notes(shown: Shown) -> str:
     return " ".join((shown.data() if isinstance(shown, Lines | Router) else shown).notes)
+
+
+def test_the_page_names_the_commits_that_measured_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    of = open_reproduction(("ratio", "efficiency"), "paper", "tiny", tmp_path / "store")
+    done = {ALL["ratio"].cells(of.request(ALL["ratio"]))[0]}
+    commits = ["a" * 40, f"{'b' * 40}+changes", ""]
+    monkeypatch.setattr(of.store, "is_done", done.__contains__)
+    monkeypatch.setattr(of.store, "export", lambda *_: [])
+    monkeypatch.setattr(
+        of.store, "rows", lambda cell: [replace(row, commit=commits[row.seed % 3]) for row in rows(20, 1)]
+    )
+    page = write_page(of, tmp_path / "page").read_text()
+    ratio, efficiency = page.split("<section")[1:]
+    said = "<code>aaaaaaaaa</code>, <code>bbbbbbbbb+changes</code>, one that nobody wrote down. Raw rows"
+    assert f"Measured by commit {said}" in ratio
+    assert "Measured by" not in efficiency
+
+
+def test_a_layer_keeps_the_commit_of_what_is_no_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    cell = ALL["efficiency"].cells(Request("paper", "tiny"))[0]
+    store = Store(tmp_path / "store")
+    with store.begin(cell) as place:
+        write_json(place / "facts.json", {"agent": "teacher"})
+        store.finish(cell, 1.0)
+    monkeypatch.setattr(store, "provenance", lambda cell: {"commit": "c" * 40, "files": {}})
+    store.export([cell], tmp_path / "layer", "facts")
+    again = Store(tmp_path / "other", [tmp_path / "layer"])
+    assert again.facts(cell) == {"agent": "teacher"}
+    assert again.shown == {"c" * 40: 1}
 
 
 def test_words_are_those_of_the_presets():

@@ -96,7 +96,9 @@ def rows_of(store: Store, cells: Sequence[Drive], legacy: Legacy | None = None) 
         else:
             missing += 1
     if missing and legacy and (old := store.legacy(legacy)) and _trainings(old) >= _trainings(found):
+        store.note(old)
         return old, ""  # never mixed with new ones
+    store.note(found)
     return found, gap(missing, len(cells))
 
 

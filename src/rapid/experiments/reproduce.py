@@ -145,7 +145,9 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
     summary: list[Markup] = []
     for exhibit in of.exhibits:
         request = of.request(exhibit)
+        of.store.shown.clear()
         shown = exhibit.show(request, of.store, exhibit)
+        measured = _commits([name for name, _ in of.store.shown.most_common()])
         command = f"rapid reproduce {exhibit.id} --recipe {request.recipe} --scale {of.scale}"
         cells = cells_of(exhibit, request.recipe, of.scale)
         raw = of.store.export(cells, out / "rows", f"{exhibit.id}-{request.recipe}-{of.scale}")
@@ -157,7 +159,7 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
             reasons = tag("ul", *(tag("li", reason) for reason in dict.fromkeys(failed)))
             blocks.append(tag("div", tag("b", f"{len(failed)} parts failed."), reasons, class_="failed"))
         links = join([tag("a", path.name, href=f"rows/{path.name}") for path in raw], " ") if raw else "none"
-        foot = tag("p", "Made with ", tag("code", command), ". Raw rows: ", links, class_="note")
+        foot = tag("p", "Made with ", tag("code", command), ". ", measured, "Raw rows: ", links, class_="note")
         sections.append(tag("section", tag("h2", exhibit.id), tag("p", exhibit.caption), *blocks, foot, id=exhibit.id))
         summary += [tag("li", sentence) for sentence in verdicts(exhibit, shown)]
     page = out / "index.html"
@@ -178,7 +180,7 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
         ]
     )
     made = ", ".join(f"{name} {version}" for name, version in about.items())
-    foot = tag("footer", f"Commit {commit() or 'unknown'}. {made}.")
+    foot = tag("footer", f"This page was written by commit {commit() or 'unknown'}. {made}.")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
     html = (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><meta name='viewport' "
@@ -188,6 +190,15 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
     )
     write_text(page, html)
     return page.resolve()
+
+
+def _commits(names: Sequence[str]) -> Markup:
+    """Return the commits that measured what an exhibit shows, shortened; they need not be the one that writes it."""
+    if not names:
+        return Markup()
+    known = [tag("code", f"{name[:9]}{'+changes' if name.endswith('+changes') else ''}") for name in names if name]
+    parts = [*known, *(["one that nobody wrote down"] if "" in names else [])]
+    return join(["Measured by commit ", join(parts, ", "), ". "])
 
 
 def _block(shown: Shown, out: Path) -> Markup:
