@@ -11,6 +11,7 @@ from rapid.experiments import readme, tables
 from rapid.experiments.exhibit import Request, Shown, method_drives, rows_of
 from rapid.experiments.exhibits import ALL, worst_entry
 from rapid.experiments.figures import Curve, Lines, Point, Router, draw, save
+from rapid.experiments.latex import latex
 from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
 from rapid.experiments.paper import PaperResult
@@ -82,9 +83,8 @@ def test_tables_are_written_in_every_form_with_what_is_missing():
     assert "inside" in tables.text(TABLE)
     markdown = tables.markdown(TABLE).splitlines()
     assert len({line.count("|") for line in markdown if line.startswith("|")}) == 1
-    latex = tables.latex(TABLE)
-    assert r"pgd\_50" in latex
-    assert r"Return \& more" in latex
+    assert r"pgd\_50" in latex(TABLE)
+    assert r"Return \& more \textbar{} under attack" in latex(TABLE)
     html = tables.html(TABLE)
     assert "<b>" not in html.split("lane-3 ")[1][:3]
     assert "not driven" in html
@@ -93,7 +93,7 @@ def test_tables_are_written_in_every_form_with_what_is_missing():
 def test_what_is_missing_of_a_cell_stands_beside_its_numbers_in_every_form():
     partial = entry(rows(20, 3), PaperResult(30, 1), "2 of 5 parts are missing")
     table = replace(TABLE, rows=((("lane-3", "RAPID"), (partial, entry(rows(20, 5)))),))
-    for form in (tables.text, tables.markdown, tables.latex, tables.html):
+    for form in (tables.text, tables.markdown, latex, tables.html):
         assert form(table).count("2 of 5 parts are missing") == 1
     assert "missing" not in tables.short(partial)  # README's rows say how many trainings they have
 
@@ -105,11 +105,34 @@ def test_every_form_shows_both_means_with_intervals_and_of_how_many_episodes():
     assert found.iqm is found.iqm  # made once: its interval is slow
     interval = f"IQM {found.iqm.value:.1f} [{found.iqm.low:.1f}, {found.iqm.high:.1f}]"
     table = replace(TABLE, rows=((("lane-3", "RAPID"), (found, untrained)),))
-    for form in (tables.text, tables.markdown, tables.latex, tables.html):
+    for form in (tables.text, tables.markdown, latex, tables.html):
         assert interval in form(table)
     html = tables.html(table)
     assert ">5×20<" in html
     assert ">20 spawns<" in html
+
+
+def test_latex_has_no_sign_that_its_usual_fonts_print_as_another_and_fits_the_text():
+    ((names, entries),) = TABLE.rows
+    assert "resizebox" not in latex(TABLE)
+    wide = latex(replace(TABLE, columns=TABLE.columns * 3, rows=((names, entries * 3),)))
+    assert wide.splitlines()[0] == "% Needs \\usepackage{booktabs,graphicx}."
+    assert "lane-3 \\textless{}b\\textgreater{}" in wide
+    assert not set(wide) & set('|<>"')
+    assert wide.count("\\resizebox{\\textwidth}{!}{%") == 1
+    assert wide.count("{") - wide.count("\\{") == wide.count("}") - wide.count("\\}")
+    assert wide.count("\\begin{tabular}") == wide.count("\\end{tabular}") == 1 + 6
+    words = Facts(
+        "prompt", "A caption.", ("who", "says"), (("[tool]", 'a "long"\nanswer\n\n' + 60 * "x"),), ("A note.",)
+    )
+    lines = latex(words).splitlines()
+    assert "\\resizebox" not in latex(words)
+    assert any(line.startswith("\\begin{tabular}{lp{0.") for line in lines)
+    (row,) = [line for line in lines if "tool" in line]
+    # A bracket after the end of a row would be read as a distance.
+    assert row.startswith("{}[tool] & a ''long''\\newline answer\\newline \\newline xxx")
+    assert any("A note." in line for line in lines)
+    assert "{ll}" in latex(Facts("short", "A caption.", ("a", "b"), (("1", "2"),)))
 
 
 def test_the_page_says_in_words_what_reproduces():

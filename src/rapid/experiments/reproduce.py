@@ -17,6 +17,7 @@ from rapid.experiments.exhibit import Exhibit, Request, Shown
 from rapid.experiments.exhibits import ALL, cells_of, recipe_of
 from rapid.experiments.figures import Lines, Router, said, save
 from rapid.experiments.graph import Outcome, plan, run
+from rapid.experiments.latex import latex
 from rapid.experiments.learned import EFFORTS
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Facts, Table
@@ -222,7 +223,7 @@ def _block(shown: Shown, out: Path) -> Markup:
             tag("details", tag("summary", "The numbers"), tables.html(facts)),
         )
     write_text(out / "tables" / f"{shown.id}.md", tables.markdown(shown) + "\n")
-    write_text(out / "tables" / f"{shown.id}.tex", tables.latex(shown) + "\n")
+    write_text(out / "tables" / f"{shown.id}.tex", latex(shown) + "\n")
     links = join(
         [tag("a", f"{shown.id}.{ending}", href=f"tables/{shown.id}.{ending}") for ending in ("md", "tex")], " "
     )

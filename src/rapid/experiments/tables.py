@@ -1,4 +1,4 @@
-"""Tables as data, and as text, Markdown, LaTeX and HTML: what is obtained stands beside what is printed.
+"""Tables as data, and as text, Markdown and HTML: what is obtained stands beside what is printed.
 
 A verdict is given where at least five trainings were driven: `inside` where the paper's mean lies in our 95 % interval,
 `above` and `below` where the interval lies above or below it; else `insufficient`.
@@ -106,6 +106,17 @@ def ours(each: Entry) -> str:
     return f"{each.mean.value:.1f}{span(each.mean)}{middle}{crash} ({count(each.mean)}{gap})"
 
 
+def parts(each: Entry) -> list[str]:
+    """Return an entry as short lines: both means, crashes, episodes, the paper's and the verdict, what is missing."""
+    said = " ".join(filter(None, (printed(each), each.verdict)))
+    if each.mean is None:
+        return [part for part in ("–", each.failed, said) if part]
+    middle = "" if each.iqm is None else f"IQM {each.iqm.value:.1f}{span(each.iqm)}"
+    crash = "" if each.crash is None else f"crash {each.crash.value:.2f} "
+    lines = (f"{each.mean.value:.1f}{span(each.mean)}", middle, f"{crash}({count(each.mean)})", said, each.failed)
+    return [part for part in lines if part]
+
+
 def span(found: Estimate) -> str:
     """Return an interval in brackets after a space; empty where there is none."""
     return "" if np.isnan(found.low) else f" [{found.low:.1f}, {found.high:.1f}]"
@@ -187,56 +198,6 @@ def compact(table: Table) -> str:
         if missing:
             parts.append(f"Not measured on {scenario}: {'; '.join(missing)}.")
     return "\n\n".join([*parts, *table.notes])
-
-
-_LATEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "&": r"\&",
-        "%": r"\%",
-        "$": r"\$",
-        "#": r"\#",
-        "_": r"\_",
-        "{": r"\{",
-        "}": r"\}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "β": r"$\beta$",
-        "±": r"$\pm$",
-        "×": r"$\times$",
-        "∞": r"$\infty$",
-        "–": "--",
-    }
-)
-
-
-def latex(table: Table | Facts) -> str:
-    """Return a table as LaTeX, in the style of booktabs."""
-
-    def line(cells: Sequence[str]) -> str:
-        return " & ".join(cell.translate(_LATEX) for cell in cells) + r" \\"
-
-    if isinstance(table, Facts):
-        heads, body = list(table.columns), [list(row) for row in table.rows]
-    else:
-        heads = [*table.heads, *table.columns]
-        body = [[*names, *map(_cells, entries)] for names, entries in table.rows]
-    return "\n".join(
-        [
-            r"\begin{table}[t]",
-            r"\centering",
-            rf"\caption{{{table.caption.translate(_LATEX)}}}",
-            rf"\label{{table:{table.id}}}",
-            rf"\begin{{tabular}}{{{'l' * len(heads)}}}",
-            r"\toprule",
-            line(heads),
-            r"\midrule",
-            *map(line, body),
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-        ]
-    )
 
 
 _MARKS = {"inside": "≈", "above": "▲", "below": "▼", "insufficient": "?", "": ""}
