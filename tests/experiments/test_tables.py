@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from rapid.experiments.latex import latex
 from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
 from rapid.experiments.paper import PaperResult
+from rapid.experiments.reasons import NOT_EXAMINED, REASONS, reason
 from rapid.experiments.reproduce import listing, open_reproduction, verdicts, write_page
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Entry, Facts, Table, entry
@@ -140,6 +142,24 @@ def test_the_page_says_in_words_what_reproduces():
     (sentence,) = verdicts(ALL["attack"], [table])
     assert "1 below" in sentence
     assert "lane-3, RAPID, none" in sentence
+
+
+def test_every_exhibit_of_the_paper_has_a_reason_or_says_that_nobody_looked(tmp_path: Path):
+    names = {name.partition(":")[0] for name in REASONS}
+    assert names <= ALL.keys()
+    assert {name.partition(":")[2] for name in REASONS} <= {"", "paper", "strong"}
+    assert {exhibit.id for exhibit in ALL.values() if exhibit.of_paper} <= names
+    assert reason("offline", "strong") == NOT_EXAMINED  # measured in the other recipe only
+    assert "router" in reason("routing", "paper")
+    docs = RESULTS.parent / "docs"
+    assert all(
+        (docs.parent / path).is_file() for text in REASONS.values() for path in re.findall(r"docs/[\w/]+\.md", text)
+    )
+    of = open_reproduction(("attack", "beta", "environment"), "paper", "tiny", tmp_path / "store")
+    page = write_page(of, tmp_path / "page").read_text()
+    assert "all five end near braking" in page
+    assert "Why, at full scale: not examined" in page
+    assert "environment: no verdicts." in page
 
 
 def test_figures_are_the_same_bytes_for_the_same_points(tmp_path: Path):

@@ -19,6 +19,7 @@ from rapid.experiments.figures import Lines, Router, said, save
 from rapid.experiments.graph import Outcome, plan, run
 from rapid.experiments.latex import latex
 from rapid.experiments.learned import EFFORTS
+from rapid.experiments.reasons import reason
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Facts, Table
 from rapid.files import write_text
@@ -162,7 +163,10 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
         links = join([tag("a", path.name, href=f"rows/{path.name}") for path in raw], " ") if raw else "none"
         foot = tag("p", "Made with ", tag("code", command), ". ", measured, "Raw rows: ", links, class_="note")
         sections.append(tag("section", tag("h2", exhibit.id), tag("p", exhibit.caption), *blocks, foot, id=exhibit.id))
-        summary += [tag("li", sentence) for sentence in verdicts(exhibit, shown)]
+        sentences = verdicts(exhibit, shown) or ([f"{exhibit.id}: no verdicts."] if exhibit.of_paper else [])
+        if sentences:
+            why = tag("small", f"Why, at full scale: {reason(exhibit.id, request.recipe)}", class_="line")
+            summary.append(tag("li", " ".join(sentences), why))
     page = out / "index.html"
     style = importlib.resources.files("rapid.experiments").joinpath("page.css").read_text(encoding="utf-8")
     about = versions()
@@ -175,7 +179,7 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
                 "crash share, and trainings × spawns; the paper's number as printed. ≈ the paper's mean lies in our "
                 "interval; ▲ our interval lies above it; ▼ below it; fewer than five trainings are no verdict.",
             ),
-            tag("h2", "What reproduces, and what does not"),
+            tag("h2", "What reproduces, what does not, and why"),
             tag("ul", *summary) if summary else tag("p", "Nothing here has numbers of the paper beside it."),
             tag("nav", *(tag("a", exhibit.id, href=f"#{exhibit.id}") for exhibit in of.exhibits)),
         ]
