@@ -137,6 +137,12 @@ def test_latex_has_no_sign_that_its_usual_fonts_print_as_another_and_fits_the_te
     assert "{ll}" in latex(Facts("short", "A caption.", ("a", "b"), (("1", "2"),)))
 
 
+def test_what_the_paper_prints_stands_also_where_ours_is_missing():
+    table = replace(TABLE, rows=((("lane-3", "RAPID"), (entry([], PaperResult(30, 1)), Entry())),))
+    for form in (tables.text, tables.markdown, tables.html):
+        assert "30.00 ± 1.00" in form(table)
+
+
 def test_the_page_says_in_words_what_reproduces():
     table = replace(TABLE, rows=((("lane-3", "RAPID"), (entry(rows(20, 5), PaperResult(30, 1)), Entry())),))
     (sentence,) = verdicts(ALL["attack"], [table])

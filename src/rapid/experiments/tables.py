@@ -222,7 +222,8 @@ def html(table: Table | Facts) -> Markup:
 
 def _html_entry(each: Entry) -> Markup:
     if each.mean is None:
-        return tag("td", "–", tag("small", each.failed), class_="missing")
+        said = tag("small", f"paper {printed(each)}", class_="line paper") if each.printed else ""
+        return tag("td", "–", tag("small", each.failed), said, class_="missing")
     mean = each.mean
     parts: list[Markup] = [tag("b", f"{mean.value:.1f}"), tag("small", span(mean))]
     if each.iqm is not None:
