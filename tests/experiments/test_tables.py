@@ -261,7 +261,7 @@ def test_the_page_names_the_commits_that_measured_what_it_shows(tmp_path: Path, 
     )
     page = write_page(of, tmp_path / "page").read_text()
     ratio, efficiency = page.split("<section")[1:]
-    said = "<code>aaaaaaaaa</code>, <code>bbbbbbbbb+changes</code>, one that nobody wrote down. Raw rows"
+    said = "<code>aaaaaaaaa</code>, <code>bbbbbbbbb+changes</code> and a commit that nobody wrote down. Raw rows"
     assert f"Measured by commit {said}" in ratio
     assert "Measured by" not in efficiency
 

@@ -202,8 +202,10 @@ def _commits(names: Sequence[str]) -> Markup:
     if not names:
         return Markup()
     known = [tag("code", f"{name[:9]}{'+changes' if name.endswith('+changes') else ''}") for name in names if name]
-    parts = [*known, *(["one that nobody wrote down"] if "" in names else [])]
-    return join(["Measured by commit ", join(parts, ", "), ". "])
+    parts = [join(["commit ", join(known, ", ")])] if known else []
+    if "" in names:
+        parts.append(Markup("a commit that nobody wrote down"))
+    return join(["Measured by ", join(parts, " and "), ". "])
 
 
 def _block(shown: Shown, out: Path) -> Markup:
