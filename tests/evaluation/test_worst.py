@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from rapid.evaluation.metrics import EpisodeRow
-from rapid.evaluation.worst import threat_of, worst_cases, worst_rows, worst_text
+from rapid.evaluation.worst import measured_under_all, threat_of, worst_cases, worst_rows, worst_text
 from rapid.report.sweep import sweep_figure, sweep_text
 
 BASE = EpisodeRow("lane-3-density-2", "a", 0, "none", 20.0, 30, False, 20.0, 600.0, 0, 3.0, (0.2,) * 5)
@@ -54,6 +54,17 @@ def test_each_training_and_each_agent_has_its_own_worst_case():
         if case.agent == "b":
             # The second spawn was not driven under every attack, so it tells nothing of the worst case.
             assert [(row.seed, row.episode_return) for row in case.rows] == [(0, 3.0)]
+
+
+def test_who_missed_an_attack_has_no_worst_case_even_where_everybody_missed_one():
+    found = [
+        *rows({"none": [20.0, 20.0], "world": [8.0], "pgd:loss=ce": [9.0, 7.0]}),
+        # A spawn driven twice under one attack met no more attacks for that.
+        *rows({"none": [20.0, 20.0]}),
+    ]
+    assert measured_under_all(found) == {(None, 0)}
+    apart = [replace(row, training_seed=int(row.attack == "world")) for row in rows({"world": [8.0], "none": [20.0]})]
+    assert measured_under_all(apart) == set()
 
 
 def test_the_text_says_what_was_worst():

@@ -56,3 +56,5 @@ def test_where_nothing_is_driven_there_are_dashes(tmp_path: Path):
     assert isinstance(table, Facts)
     assert len(table.rows) == sum(len(pair.scenarios) for pair in PAIRS["paper"])
     assert all(cell == "–" for row in table.rows for cell in row[3:])
+    sides = len({(name, scenario) for pair in PAIRS["paper"] for name in pair[1:3] for scenario in pair.scenarios}) * 5
+    assert table.notes[-1].startswith(f"{sides} of {sides} drives")

@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,15 +9,18 @@ import pytest
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import readme, tables
-from rapid.experiments.exhibit import Request, method_drives, rows_of
-from rapid.experiments.exhibits import ALL
-from rapid.experiments.figures import Curve, Lines, Point, Router, save
+from rapid.experiments.exhibit import Request, Shown, method_drives, rows_of
+from rapid.experiments.exhibits import ALL, worst_entry
+from rapid.experiments.figures import Curve, Lines, Point, Router, draw, save
+from rapid.experiments.latex import latex
 from rapid.experiments.methods import METHODS
 from rapid.experiments.migrate import FILES, LABELS, Legacy, legacy_rows
 from rapid.experiments.paper import PaperResult
+from rapid.experiments.reasons import NOT_EXAMINED, REASONS, reason
 from rapid.experiments.reproduce import listing, open_reproduction, verdicts, write_page
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Entry, Facts, Table, entry
+from rapid.files import write_json
 
 RESULTS = Path(__file__).parents[2] / "results"
 
@@ -48,6 +52,19 @@ def test_a_verdict_needs_five_trainings_and_an_interval(mean: float, seeds: int,
     assert entry(rows(mean, seeds), PaperResult(printed, 3.0)).verdict == verdict
 
 
+def test_the_worst_case_counts_only_trainings_that_met_every_attack():
+    strong = [replace(row, agent="of before cells") for row in rows(5, 3)]
+    each = worst_entry({"none": (rows(20, 5), ""), "world": (strong, "2 of 5 parts are missing")})
+    assert each.mean is not None
+    assert each.mean.value == pytest.approx(5)  # never the 20 of trainings that were not attacked
+    assert (each.mean.training_seeds, each.mean.episodes) == (3, 60)
+    assert each.failed == "world: 2 of 5 parts are missing"
+    nobody = worst_entry({"none": (rows(20, 1), ""), "world": ([], "5 of 5 parts are missing")})
+    assert (nobody.mean, nobody.failed) == (None, "world: 5 of 5 parts are missing")
+    apart = {"none": (rows(20, 1), ""), "world": ([replace(row, training_seed=1) for row in rows(5, 1)], "")}
+    assert worst_entry(apart).failed == "no training met every attack"
+
+
 def test_no_numbers_of_the_paper_are_no_verdict():
     assert entry(rows(20, 5)).verdict == ""
     assert entry([], PaperResult(1, 1), "2 of 3 parts are missing").verdict == ""
@@ -68,12 +85,62 @@ def test_tables_are_written_in_every_form_with_what_is_missing():
     assert "inside" in tables.text(TABLE)
     markdown = tables.markdown(TABLE).splitlines()
     assert len({line.count("|") for line in markdown if line.startswith("|")}) == 1
-    latex = tables.latex(TABLE)
-    assert r"pgd\_50" in latex
-    assert r"Return \& more" in latex
+    assert r"pgd\_50" in latex(TABLE)
+    assert r"Return \& more \textbar{} under attack" in latex(TABLE)
     html = tables.html(TABLE)
     assert "<b>" not in html.split("lane-3 ")[1][:3]
     assert "not driven" in html
+
+
+def test_what_is_missing_of_a_cell_stands_beside_its_numbers_in_every_form():
+    partial = entry(rows(20, 3), PaperResult(30, 1), "2 of 5 parts are missing")
+    table = replace(TABLE, rows=((("lane-3", "RAPID"), (partial, entry(rows(20, 5)))),))
+    for form in (tables.text, tables.markdown, latex, tables.html):
+        assert form(table).count("2 of 5 parts are missing") == 1
+    assert "missing" not in tables.short(partial)  # README's rows say how many trainings they have
+
+
+def test_every_form_shows_both_means_with_intervals_and_of_how_many_episodes():
+    found = entry(rows(20, 5))
+    untrained = entry([replace(row, training_seed=None) for row in rows(20, 1)])
+    assert found.iqm is not None
+    assert found.iqm is found.iqm  # made once: its interval is slow
+    interval = f"IQM {found.iqm.value:.1f} [{found.iqm.low:.1f}, {found.iqm.high:.1f}]"
+    table = replace(TABLE, rows=((("lane-3", "RAPID"), (found, untrained)),))
+    for form in (tables.text, tables.markdown, latex, tables.html):
+        assert interval in form(table)
+    html = tables.html(table)
+    assert ">5×20<" in html
+    assert ">20 spawns<" in html
+
+
+def test_latex_has_no_sign_that_its_usual_fonts_print_as_another_and_fits_the_text():
+    ((names, entries),) = TABLE.rows
+    assert "resizebox" not in latex(TABLE)
+    wide = latex(replace(TABLE, columns=TABLE.columns * 3, rows=((names, entries * 3),)))
+    assert wide.splitlines()[0] == "% Needs \\usepackage{booktabs,graphicx}."
+    assert "lane-3 \\textless{}b\\textgreater{}" in wide
+    assert not set(wide) & set('|<>"')
+    assert wide.count("\\resizebox{\\textwidth}{!}{%") == 1
+    assert wide.count("{") - wide.count("\\{") == wide.count("}") - wide.count("\\}")
+    assert wide.count("\\begin{tabular}") == wide.count("\\end{tabular}") == 1 + 6
+    words = Facts(
+        "prompt", "A caption.", ("who", "says"), (("[tool]", 'a "long"\nanswer\n\n' + 60 * "x"),), ("A note.",)
+    )
+    lines = latex(words).splitlines()
+    assert "\\resizebox" not in latex(words)
+    assert any(line.startswith("\\begin{tabular}{lp{0.") for line in lines)
+    (row,) = [line for line in lines if "tool" in line]
+    # A bracket after the end of a row would be read as a distance.
+    assert row.startswith("{}[tool] & a ''long''\\newline answer\\newline \\newline xxx")
+    assert any("A note." in line for line in lines)
+    assert "{ll}" in latex(Facts("short", "A caption.", ("a", "b"), (("1", "2"),)))
+
+
+def test_what_the_paper_prints_stands_also_where_ours_is_missing():
+    table = replace(TABLE, rows=((("lane-3", "RAPID"), (entry([], PaperResult(30, 1)), Entry())),))
+    for form in (tables.text, tables.markdown, tables.html):
+        assert "30.00 ± 1.00" in form(table)
 
 
 def test_the_page_says_in_words_what_reproduces():
@@ -81,6 +148,24 @@ def test_the_page_says_in_words_what_reproduces():
     (sentence,) = verdicts(ALL["attack"], [table])
     assert "1 below" in sentence
     assert "lane-3, RAPID, none" in sentence
+
+
+def test_every_exhibit_of_the_paper_has_a_reason_or_says_that_nobody_looked(tmp_path: Path):
+    names = {name.partition(":")[0] for name in REASONS}
+    assert names <= ALL.keys()
+    assert {name.partition(":")[2] for name in REASONS} <= {"", "paper", "strong"}
+    assert {exhibit.id for exhibit in ALL.values() if exhibit.of_paper} <= names
+    assert reason("offline", "strong") == NOT_EXAMINED  # measured in the other recipe only
+    assert "router" in reason("routing", "paper")
+    docs = RESULTS.parent / "docs"
+    assert all(
+        (docs.parent / path).is_file() for text in REASONS.values() for path in re.findall(r"docs/[\w/]+\.md", text)
+    )
+    of = open_reproduction(("attack", "beta", "environment"), "paper", "tiny", tmp_path / "store")
+    page = write_page(of, tmp_path / "page").read_text()
+    assert "all five end near braking" in page
+    assert "Why, at full scale: not examined" in page
+    assert "environment: no verdicts." in page
 
 
 def test_figures_are_the_same_bytes_for_the_same_points(tmp_path: Path):
@@ -136,6 +221,62 @@ def test_a_page_of_nothing_says_what_is_missing(tmp_path: Path, monkeypatch: pyt
     assert "KinematicsObservation" in page
     assert (tmp_path / "page" / "tables" / "attack.tex").exists()
     assert (tmp_path / "page" / "figures" / "ratio.svg").exists()
+
+
+def test_no_figure_and_no_table_of_words_hides_that_parts_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    store = Store(tmp_path / "store")
+    for exhibit in ALL.values():
+        request = Request(exhibit.recipes[0], "tiny")
+        for shown in exhibit.show(request, store, exhibit) if exhibit.cells(request) else ():
+            if isinstance(shown, Table):
+                continue  # says so in each of its cells
+            assert "othing has been computed yet: " in _notes(shown) or "are missing" in _notes(shown), exhibit.id
+            assert isinstance(shown, Facts) or not shown.complete
+    request = Request("paper", "tiny")
+    (ratio,) = ALL["ratio"].show(request, store, ALL["ratio"])
+    count = len(ALL["ratio"].cells(request))
+    assert _notes(ratio) == f"Nothing has been computed yet: {count} parts."
+    first = ALL["ratio"].cells(request)[0]
+    monkeypatch.setattr(store, "is_done", lambda cell: cell == first)
+    monkeypatch.setattr(store, "rows", lambda cell: rows(20, 1))
+    (ratio,) = ALL["ratio"].show(request, store, ALL["ratio"])
+    assert _notes(ratio) == f"{count - 1} of {count} parts are missing."
+    assert isinstance(ratio, Lines)
+    assert draw(ratio).axes[0].get_title("right") == f"{count - 1} of {count} parts are missing"
+
+
+def _notes(shown: Shown) -> str:
+    return " ".join((shown.data() if isinstance(shown, Lines | Router) else shown).notes)
+
+
+def test_the_page_names_the_commits_that_measured_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    of = open_reproduction(("ratio", "efficiency"), "paper", "tiny", tmp_path / "store")
+    done = {ALL["ratio"].cells(of.request(ALL["ratio"]))[0]}
+    commits = ["a" * 40, f"{'b' * 40}+changes", ""]
+    monkeypatch.setattr(of.store, "is_done", done.__contains__)
+    monkeypatch.setattr(of.store, "export", lambda *_: [])
+    monkeypatch.setattr(
+        of.store, "rows", lambda cell: [replace(row, commit=commits[row.seed % 3]) for row in rows(20, 1)]
+    )
+    page = write_page(of, tmp_path / "page").read_text()
+    ratio, efficiency = page.split("<section")[1:]
+    said = "<code>aaaaaaaaa</code>, <code>bbbbbbbbb+changes</code> and a commit that nobody wrote down. Raw rows"
+    assert f"Measured by commit {said}" in ratio
+    assert "Measured by" not in efficiency
+
+
+def test_a_layer_keeps_the_commit_of_what_is_no_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    cell = ALL["efficiency"].cells(Request("paper", "tiny"))[0]
+    store = Store(tmp_path / "store")
+    with store.begin(cell) as place:
+        write_json(place / "facts.json", {"agent": "teacher"})
+        store.finish(cell, 1.0)
+    monkeypatch.setattr(store, "provenance", lambda cell: {"commit": "c" * 40, "files": {}})
+    store.export([cell], tmp_path / "layer", "facts")
+    again = Store(tmp_path / "other", [tmp_path / "layer"])
+    assert again.facts(cell) == {"agent": "teacher"}
+    assert again.shown == {"c" * 40: 1}
 
 
 def test_words_are_those_of_the_presets():

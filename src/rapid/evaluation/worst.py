@@ -103,17 +103,23 @@ def worst_cases(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[
             attacks = tuple(dict.fromkeys(row.attack for row in chosen if row.attack != "none"))
             if not attacks:
                 continue
-            complete = _measured_under_all(chosen)
+            complete = measured_under_all(chosen)
             worst = [row for row in worst_rows(chosen) if (row.training_seed, row.seed) in complete]
             if worst:
                 found.append(_worst(scenario, agent, threat, attacks, worst, resamples))
     return found
 
 
-def _measured_under_all(rows: Sequence[EpisodeRow]) -> set[tuple[int | None, int]]:
-    counts = Counter((row.training_seed, row.seed) for row in rows)
-    most = max(counts.values())
-    return {key for key, count in counts.items() if count == most}
+def measured_under_all(rows: Sequence[EpisodeRow]) -> set[tuple[int | None, int]]:
+    """Return the trainings and spawns of one agent that met every attack among its rows.
+
+    Where an attack is missing, the least return is one over fewer attacks, and too good.
+    """
+    met: dict[tuple[int | None, int], set[str]] = {}
+    for row in rows:
+        met.setdefault((row.training_seed, row.seed), set()).add(row.attack)
+    every = {row.attack for row in rows}
+    return {key for key, attacks in met.items() if attacks == every}
 
 
 def _worst(

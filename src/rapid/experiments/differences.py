@@ -61,20 +61,25 @@ def cells(request: Request) -> list[Cell]:
 def show(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]:
     """Return the differences as one table; a pair of which one side was not driven has dashes."""
     rows: list[tuple[str, ...]] = []
+    whole: dict[tuple[str, str, str], bool] = {}
     for pair in PAIRS[request.recipe]:
         ours, theirs = METHODS[pair.ours], METHODS[pair.theirs]
         for scenario in pair.scenarios:
-            found = [
-                difference(*(rows_under(request, store, scenario, method, attack)[0] for method in (ours, theirs)))
-                for attack in ATTACKS
-            ]
+            found: list[Estimate | None] = []
+            for attack in ATTACKS:
+                sides = [rows_under(request, store, scenario, method, attack) for method in (ours, theirs)]
+                found.append(difference(*(episodes for episodes, _ in sides)))
+                for method, (_, why) in zip((ours, theirs), sides, strict=True):
+                    whole[scenario, method.id, attack] = not why
             rows.append((pair.question, f"{ours.label} − {theirs.label}", scenario, *map(told, found)))
     note = (
         "Return of the first less that of the second, in the mean over the spawns that both drove. 95 % intervals are "
         "bootstrapped over trainings and spawns. One that holds no 0 is a difference beyond the chance of both."
     )
     heads = ("about", "difference", "scenario", *ATTACKS)
-    return [Facts(exhibit.id, exhibit.caption, heads, tuple(rows), (note,))]
+    missing = list(whole.values()).count(False)
+    gaps = (f"{missing} of {len(whole)} drives of a method under an attack are missing in whole or in part.",)
+    return [Facts(exhibit.id, exhibit.caption, heads, tuple(rows), (note, *(gaps if missing else ())))]
 
 
 def difference(ours: list[EpisodeRow], theirs: list[EpisodeRow]) -> Estimate | None:

@@ -8,7 +8,7 @@ from rapid.attacks.spec import NAMED
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import learned as make
 from rapid.experiments import words
-from rapid.experiments.cells import Cell, Drive, Driven, Driver
+from rapid.experiments.cells import Cell, Drive, Driven, Driver, key
 from rapid.experiments.figures import Lines, Router
 from rapid.experiments.learned import Setting
 from rapid.experiments.methods import METHODS, Method
@@ -96,8 +96,26 @@ def rows_of(store: Store, cells: Sequence[Drive], legacy: Legacy | None = None) 
         else:
             missing += 1
     if missing and legacy and (old := store.legacy(legacy)) and _trainings(old) >= _trainings(found):
+        store.note(old)
         return old, ""  # never mixed with new ones
-    return found, f"{missing} of {len(cells)} parts are missing" if missing else ""
+    store.note(found)
+    return found, gap(missing, len(cells))
+
+
+def gap(missing: int, count: int) -> str:
+    """Return how many parts are missing, in words; empty where none is."""
+    if not missing:
+        return ""
+    return f"{missing} of {count} parts are missing"
+
+
+def gap_of(store: Store, cells: Sequence[Cell]) -> str:
+    """Return what a figure lacks of its cells, in words; empty where it is whole."""
+    every = {key(cell): cell for cell in cells}
+    missing = sum(not store.is_done(cell) for cell in every.values())
+    if missing < len(every):
+        return gap(missing, len(every))
+    return f"nothing has been computed yet: {missing} part{'s' if missing > 1 else ''}" if missing else ""
 
 
 def _trainings(rows: Sequence[EpisodeRow]) -> int:

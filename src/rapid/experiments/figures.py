@@ -103,11 +103,13 @@ class Lines:
     y: str
     mark: float | None = None
     """Where a new phase begins."""
+    gap: str = ""
+    """What is missing, in words."""
 
     @property
     def complete(self) -> bool:
-        """Whether every curve has points."""
-        return all(curve.points for curve in self.curves)
+        """Whether nothing is missing and every curve has points."""
+        return not self.gap and all(curve.points for curve in self.curves)
 
     def data(self) -> Facts:
         """Return the points as a table."""
@@ -116,7 +118,8 @@ class Lines:
             for curve in self.curves
             for point in curve.points
         ]
-        return Facts(self.id, self.caption, ("curve", self.x, self.y, "from, to"), tuple(rows))
+        notes = (said(self.gap),) if self.gap else ()
+        return Facts(self.id, self.caption, ("curve", self.x, self.y, "from, to"), tuple(rows), notes)
 
 
 @dataclass(frozen=True)
@@ -129,11 +132,13 @@ class Router:
     weights: Sequence[Sequence[float]]
     """Signed weights, a row a vehicle, a column a policy."""
     lanes: int
+    gap: str = ""
+    """What other scenes lack, in words."""
 
     @property
     def complete(self) -> bool:
-        """A scene is whole."""
-        return True
+        """A scene is whole; others may be missing."""
+        return not self.gap
 
     def data(self) -> Facts:
         """Return the weights as a table."""
@@ -143,7 +148,13 @@ class Router:
             if row[FEATURES.index("presence")] >= 0.5
         ]
         names = [f"policy {number}" for number in range(1, len(self.weights[0]) + 1)]
-        return Facts(self.id, self.caption, ("vehicle", *names), tuple(rows))
+        notes = (said(self.gap),) if self.gap else ()
+        return Facts(self.id, self.caption, ("vehicle", *names), tuple(rows), notes)
+
+
+def said(gap: str) -> str:
+    """Return what is missing as a sentence; empty where nothing is."""
+    return f"{gap[:1].upper()}{gap[1:]}." if gap else ""
 
 
 def _span(point: Point) -> str:
@@ -196,10 +207,14 @@ def _lines(shown: Lines) -> Figure:
     axes.set_xlabel(shown.x)
     axes.set_ylabel(shown.y)
     axes.grid(axis="y", alpha=0.3)
+    if shown.gap:
+        # The picture says so itself: it is also used without its page.
+        axes.set_title(shown.gap, loc="right", fontsize=8, color="0.3")
     if any(curve.points for curve in shown.curves):
         axes.legend(frameon=False, fontsize=9)
     else:
-        axes.text(0.5, 0.5, "nothing has been computed yet", ha="center", transform=axes.transAxes)
+        nothing = shown.gap or "nothing has been computed yet"
+        axes.text(0.5, 0.5, nothing, ha="center", transform=axes.transAxes)
     return figure
 
 

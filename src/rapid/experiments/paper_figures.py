@@ -1,16 +1,17 @@
 """The paper's figures: teacher under attack, ratio of data, online adaptation, the robust term, routing."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 from rapid.config import MixConfig, TeacherConfig
 from rapid.experiments import learned as make
 from rapid.experiments.cells import Adapt, Cell, Collect, Distill, Drive, Driven, Driver, Mix, Scenes
-from rapid.experiments.exhibit import Exhibit, Request, Shown, driven, drives, method_drives, rows_of
-from rapid.experiments.figures import Curve, Lines, Router
+from rapid.experiments.exhibit import Exhibit, Request, Shown, driven, drives, gap_of, method_drives, rows_of
+from rapid.experiments.figures import Curve, Lines, Router, said
 from rapid.experiments.learned import OFFLINE_ITERATIONS, Reading, mixture
 from rapid.experiments.methods import METHODS
 from rapid.experiments.store import Store
-from rapid.experiments.tables import entry
+from rapid.experiments.tables import Facts, entry
 from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 
 NOISE = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
@@ -37,12 +38,12 @@ def _attacked(request: Request) -> dict[str, list[Driven]]:
     }
 
 
-def teacher_attack_cells(request: Request) -> list[Cell]:
+def teacher_attack_cells(request: Request, kinds: Sequence[str] = ("uniform", "gaussian")) -> list[Cell]:
     return [
         cell
         for agents in _attacked(request).values()
         for agent in agents
-        for kind in ("uniform", "gaussian")
+        for kind in kinds
         for size in (0.0, *NOISE)
         for cell in _noise(request, agent, kind, size)
     ]
@@ -65,6 +66,7 @@ def show_teacher_attack(request: Request, store: Store, exhibit: Exhibit) -> lis
                 tuple(curves),
                 "size of the noise (1 is 200 m along the road)",
                 "return",
+                gap=gap_of(store, teacher_attack_cells(request, (kind,))),
             )
         )
     return shown
@@ -98,7 +100,8 @@ def show_ratio(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]:
         )
         for algorithm in ("ddqn", "cql")
     ]
-    return [Lines("ratio", exhibit.caption, tuple(curves), "share of the teacher's transitions, %", "return")]
+    gap = gap_of(store, exhibit.cells(request))
+    return [Lines("ratio", exhibit.caption, tuple(curves), "share of the teacher's transitions, %", "return", gap=gap)]
 
 
 def _online_agents(request: Request, scenario: str) -> dict[str, list[Adapt]]:
@@ -109,9 +112,9 @@ def _online_agents(request: Request, scenario: str) -> dict[str, list[Adapt]]:
     }
 
 
-def online_cells(request: Request) -> list[Cell]:
+def online_cells(request: Request, scenarios: Sequence[str] = PAPER_SCENARIOS) -> list[Cell]:
     found: list[Cell] = []
-    for scenario in PAPER_SCENARIOS:
+    for scenario in scenarios:
         for agents in _online_agents(request, scenario).values():
             found += agents
             found += [agent.origin for agent in agents if isinstance(agent.origin, Distill)]
@@ -151,6 +154,7 @@ def show_online(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]
                 "iterations offline, then steps online",
                 "return on tuning spawns",
                 mark=before,
+                gap=gap_of(store, online_cells(request, (scenario,))),
             )
         )
     return shown
@@ -173,7 +177,8 @@ def show_robust(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]
         )
         for scenario, reading in readings()
     ]
-    return [Lines("j-robust", exhibit.caption, tuple(curves), "iterations", "J_robust")]
+    gap = gap_of(store, exhibit.cells(request))
+    return [Lines("j-robust", exhibit.caption, tuple(curves), "iterations", "J_robust", gap=gap)]
 
 
 def readings() -> list[tuple[str, Reading]]:
@@ -192,10 +197,16 @@ def routing_cell(request: Request) -> Scenes:
 
 
 def show_routing(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]:
-    facts = store.facts(routing_cell(request))
+    cell = routing_cell(request)
+    scenes = store.facts(cell).get("scenes", ())
+    whole = [(number, scene) for number, scene in enumerate(scenes, 1) if scene["weights"] is not None]
+    gap = gap_of(store, [cell])
+    if len(whole) < len(scenes):
+        gap = f"{len(scenes) - len(whole)} of {len(scenes)} scenes have no weights"
+    if not whole:
+        return [Facts("routing", exhibit.caption, ("vehicle", "policy 1", "policy 2"), (), (said(gap),))]
     lanes = get_scenario(PAPER_SCENARIOS[1]).lanes
     return [
-        Router(f"routing-{number}", f"{exhibit.caption} Scene {number}.", scene["obs"], scene["weights"], lanes)
-        for number, scene in enumerate(facts.get("scenes", ()), 1)
-        if scene["weights"] is not None
+        Router(f"routing-{number}", f"{exhibit.caption} Scene {number}.", scene["obs"], scene["weights"], lanes, gap)
+        for number, scene in whole
     ]

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from rapid.experiments import learned as make
 from rapid.experiments import words
 from rapid.experiments.cells import Adapt, Cell, Decide, Distill, Drive, Mix
-from rapid.experiments.exhibit import ATTACKS, Exhibit, Request, Shown, applicable, comparison, drives, rows_of
+from rapid.experiments.exhibit import ATTACKS, Exhibit, Request, Shown, applicable, comparison, drives, gap_of, rows_of
+from rapid.experiments.figures import said
 from rapid.experiments.learned import Dataset, Reading, Setting, mixture
 from rapid.experiments.methods import METHODS
 from rapid.experiments.paper import paper_result
@@ -107,7 +108,8 @@ def efficiency_cells(request: Request) -> list[Decide]:
 
 
 def show_efficiency(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]:
-    return [words.efficiency(exhibit.caption, [store.facts(cell) for cell in efficiency_cells(request)])]
+    cells = efficiency_cells(request)
+    return [words.efficiency(exhibit.caption, [store.facts(cell) for cell in cells], said(gap_of(store, cells)))]
 
 
 def mixing_cells(request: Request) -> list[Cell]:
@@ -133,7 +135,9 @@ def show_mixing(request: Request, store: Store, exhibit: Exhibit) -> list[Shown]
                 f"{1e3 * seconds['median_seconds']:.2f} ms" if seconds else "–",
             )
         )
-    shown.append(Facts("mixing-cost", "Gate and cost of the two.", ("method", "gate", "one decision"), tuple(rows)))
+    gap = gap_of(store, [cell for cell in mixing_cells(request) if not isinstance(cell, Drive)])
+    heads, notes = ("method", "gate", "one decision"), (said(gap),) if gap else ()
+    shown.append(Facts("mixing-cost", "Gate and cost of the two.", heads, tuple(rows), notes))
     return shown
 
 

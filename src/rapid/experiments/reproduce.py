@@ -15,9 +15,11 @@ from rapid.experiments import tables
 from rapid.experiments.cells import Cell, key
 from rapid.experiments.exhibit import Exhibit, Request, Shown
 from rapid.experiments.exhibits import ALL, cells_of, recipe_of
-from rapid.experiments.figures import Lines, Router, save
+from rapid.experiments.figures import Lines, Router, said, save
 from rapid.experiments.graph import Outcome, plan, run
+from rapid.experiments.latex import latex
 from rapid.experiments.learned import EFFORTS
+from rapid.experiments.reasons import reason
 from rapid.experiments.store import Store
 from rapid.experiments.tables import Facts, Table
 from rapid.files import write_text
@@ -145,7 +147,9 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
     summary: list[Markup] = []
     for exhibit in of.exhibits:
         request = of.request(exhibit)
+        of.store.shown.clear()
         shown = exhibit.show(request, of.store, exhibit)
+        measured = _commits([name for name, _ in of.store.shown.most_common()])
         command = f"rapid reproduce {exhibit.id} --recipe {request.recipe} --scale {of.scale}"
         cells = cells_of(exhibit, request.recipe, of.scale)
         raw = of.store.export(cells, out / "rows", f"{exhibit.id}-{request.recipe}-{of.scale}")
@@ -157,9 +161,12 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
             reasons = tag("ul", *(tag("li", reason) for reason in dict.fromkeys(failed)))
             blocks.append(tag("div", tag("b", f"{len(failed)} parts failed."), reasons, class_="failed"))
         links = join([tag("a", path.name, href=f"rows/{path.name}") for path in raw], " ") if raw else "none"
-        foot = tag("p", "Made with ", tag("code", command), ". Raw rows: ", links, class_="note")
+        foot = tag("p", "Made with ", tag("code", command), ". ", measured, "Raw rows: ", links, class_="note")
         sections.append(tag("section", tag("h2", exhibit.id), tag("p", exhibit.caption), *blocks, foot, id=exhibit.id))
-        summary += [tag("li", sentence) for sentence in verdicts(exhibit, shown)]
+        sentences = verdicts(exhibit, shown) or ([f"{exhibit.id}: no verdicts."] if exhibit.of_paper else [])
+        if sentences:
+            why = tag("small", f"Why, at full scale: {reason(exhibit.id, request.recipe)}", class_="line")
+            summary.append(tag("li", " ".join(sentences), why))
     page = out / "index.html"
     style = importlib.resources.files("rapid.experiments").joinpath("page.css").read_text(encoding="utf-8")
     about = versions()
@@ -168,17 +175,17 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
             tag("h1", "The paper, reproduced"),
             tag(
                 "p",
-                f"Recipe {of.recipe}, scale {of.scale}. Ours: mean with 95 % interval, interquartile mean (IQM) and "
-                "crash share; the paper's number as printed. ≈ the paper's mean lies in our interval; ▲ our interval "
-                "lies above it; ▼ below it; fewer than five trainings are no verdict.",
+                f"Recipe {of.recipe}, scale {of.scale}. Ours: mean and interquartile mean (IQM) with 95 % intervals, "
+                "crash share, and trainings × spawns; the paper's number as printed. ≈ the paper's mean lies in our "
+                "interval; ▲ our interval lies above it; ▼ below it; fewer than five trainings are no verdict.",
             ),
-            tag("h2", "What reproduces, and what does not"),
+            tag("h2", "What reproduces, what does not, and why"),
             tag("ul", *summary) if summary else tag("p", "Nothing here has numbers of the paper beside it."),
             tag("nav", *(tag("a", exhibit.id, href=f"#{exhibit.id}") for exhibit in of.exhibits)),
         ]
     )
     made = ", ".join(f"{name} {version}" for name, version in about.items())
-    foot = tag("footer", f"Commit {commit() or 'unknown'}. {made}.")
+    foot = tag("footer", f"This page was written by commit {commit() or 'unknown'}. {made}.")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
     html = (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><meta name='viewport' "
@@ -188,6 +195,17 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
     )
     write_text(page, html)
     return page.resolve()
+
+
+def _commits(names: Sequence[str]) -> Markup:
+    """Return the commits that measured what an exhibit shows, shortened; they need not be the one that writes it."""
+    if not names:
+        return Markup()
+    known = [tag("code", f"{name[:9]}{'+changes' if name.endswith('+changes') else ''}") for name in names if name]
+    parts = [join(["commit ", join(known, ", ")])] if known else []
+    if "" in names:
+        parts.append(Markup("a commit that nobody wrote down"))
+    return join(["Measured by ", join(parts, " and "), ". "])
 
 
 def _block(shown: Shown, out: Path) -> Markup:
@@ -200,11 +218,18 @@ def _block(shown: Shown, out: Path) -> Markup:
         return tag(
             "figure",
             Markup(f'<img alt="{tables_text(facts)}" src="data:image/png;base64,{picture}">'),
-            tag("figcaption", shown.caption, " ", links),
+            tag(
+                "figcaption",
+                shown.caption,
+                " ",
+                tag("b", said(shown.gap), class_="gap") if shown.gap else "",
+                " ",
+                links,
+            ),
             tag("details", tag("summary", "The numbers"), tables.html(facts)),
         )
     write_text(out / "tables" / f"{shown.id}.md", tables.markdown(shown) + "\n")
-    write_text(out / "tables" / f"{shown.id}.tex", tables.latex(shown) + "\n")
+    write_text(out / "tables" / f"{shown.id}.tex", latex(shown) + "\n")
     links = join(
         [tag("a", f"{shown.id}.{ending}", href=f"tables/{shown.id}.{ending}") for ending in ("md", "tex")], " "
     )

@@ -8,6 +8,7 @@ directory with the small results of many cells: ``*.parquet`` (episode rows with
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from functools import cache, cached_property
@@ -42,6 +43,8 @@ class Store:
 
     def __init__(self, root: Path, layers: Sequence[Path] = (), results: Path | None = None) -> None:
         self.root, self.layers, self._results = root, tuple(layers), results
+        self.shown: Counter[str] = Counter()
+        """Commits of what tables and figures have taken from here; a page clears it before each of them."""
         marker = root / "store.json"
         if marker.exists():
             found = read_json(marker, "store of results")
@@ -125,8 +128,19 @@ class Store:
         """Return committed rows from before there were cells."""
         return legacy_rows(self._results, wanted) if self._results else []
 
+    def note(self, rows: Iterable[EpisodeRow]) -> None:
+        """Remember the commits of rows that are shown."""
+        self.shown.update(row.commit for row in rows)
+
+    def commit(self, cell: Cell) -> str:
+        """Return the commit that computed a done cell; empty where nobody wrote it down."""
+        found = self._layered.get(key(cell))
+        return self.provenance(cell).get("commit", "") or (found.get("commit", "") if isinstance(found, dict) else "")
+
     def metrics(self, cell: Cell) -> list[dict[str, Any]]:
         """Return the metrics of a training, its second part after the first."""
+        if self.is_done(cell):
+            self.shown[self.commit(cell)] += 1
         if self.is_here(cell):
             return _all_metrics(self.place(cell))
         found = self._layered.get(key(cell))
@@ -134,6 +148,8 @@ class Store:
 
     def facts(self, cell: Cell) -> dict[str, Any]:
         """Return the facts that a cell of another kind gives."""
+        if self.is_done(cell):
+            self.shown[self.commit(cell)] += 1
         if self.is_here(cell):
             return read_json(self.place(cell) / FACTS, "facts of a cell")
         found = self._layered.get(key(cell))
@@ -154,10 +170,12 @@ class Store:
                 continue
             if isinstance(cell, Drive):
                 tables.append(_with_cell(self.rows(cell), cell, self.root))
-            elif metrics := self.metrics(cell) if kind_of(cell) in ("distill", "adapt") else []:
-                lines.append(json.dumps({"cell": key(cell), "spec": describe(cell), "metrics": metrics}))
+                continue
+            about = {"cell": key(cell), "spec": describe(cell), "commit": self.commit(cell)}
+            if metrics := self.metrics(cell) if kind_of(cell) in ("distill", "adapt") else []:
+                lines.append(json.dumps({**about, "metrics": metrics}))
             elif kind_of(cell) in ("scenes", "decide"):
-                lines.append(json.dumps({"cell": key(cell), "spec": describe(cell), "facts": self.facts(cell)}))
+                lines.append(json.dumps({**about, "facts": self.facts(cell)}))
         written: list[Path] = []
         if tables:
             written.append(folder / f"{name}.parquet")

@@ -1,4 +1,4 @@
-"""Tables as data, and as text, Markdown, LaTeX and HTML: what is obtained stands beside what is printed.
+"""Tables as data, and as text, Markdown and HTML: what is obtained stands beside what is printed.
 
 A verdict is given where at least five trainings were driven: `inside` where the paper's mean lies in our 95 % interval,
 `above` and `below` where the interval lies above or below it; else `insufficient`.
@@ -6,6 +6,7 @@ A verdict is given where at least five trainings were driven: `inside` where the
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,8 @@ from rapid.evaluation.summary import aligned
 from rapid.experiments.paper import PaperResult
 from rapid.pages.markup import Markup, join, tag
 
+IQM_RESAMPLES = 1_000
+"""Of the bootstrap behind the interval of an interquartile mean: a page has hundreds of them, and each sorts."""
 Verdict = Literal["inside", "above", "below", "insufficient", ""]
 
 
@@ -25,15 +28,15 @@ class Entry:
 
     mean: Estimate | None = None
     iqm_of: Callable[[], Estimate] | None = None
-    """Makes the interquartile mean; its interval takes as long as the others together, and few tables show it."""
+    """Makes the interquartile mean; its interval takes as long as the others together, and README shows none."""
     crash: Estimate | None = None
     printed: PaperResult | None = None
     failed: str = ""
-    """Why there is nothing."""
+    """Why there is nothing, or less than there should be."""
 
-    @property
+    @cached_property
     def iqm(self) -> Estimate | None:
-        """The interquartile mean."""
+        """The interquartile mean, made once for all forms of a table."""
         return self.iqm_of() if self.iqm_of else None
 
     @property
@@ -57,9 +60,10 @@ def entry(rows: Sequence[EpisodeRow], printed: PaperResult | None = None, failed
     returns, crashes = column(rows, "episode_return"), column(rows, "crashed")
     return Entry(
         estimate(returns, spawns, seeds),
-        lambda: estimate(returns, spawns, seeds, statistic="iqm"),
+        lambda: estimate(returns, spawns, seeds, statistic="iqm", resamples=IQM_RESAMPLES),
         estimate(crashes, spawns, seeds),
         printed,
+        failed,
     )
 
 
@@ -93,16 +97,34 @@ class Facts:
 
 
 def ours(each: Entry) -> str:
-    """Return our mean with its interval, the IQM and the number of trainings or spawns."""
+    """Return our mean with its interval, the IQM, the number of trainings or spawns, and what of them is missing."""
     if each.mean is None:
         return f"– ({each.failed})" if each.failed else "–"
-    mean = each.mean
-    span = "" if np.isnan(mean.low) else f" [{mean.low:.1f}, {mean.high:.1f}]"
-    iqm = each.iqm
-    middle = "" if iqm is None else f", IQM {iqm.value:.1f}"
+    middle = "" if each.iqm is None else f", IQM {each.iqm.value:.1f}{span(each.iqm)}"
     crash = "" if each.crash is None else f", crash {each.crash.value:.2f}"
-    count = f"{mean.training_seeds}×{mean.spawns}" if mean.training_seeds else f"{mean.spawns}"
-    return f"{mean.value:.1f}{span}{middle}{crash} ({count})"
+    gap = f"; {each.failed}" if each.failed else ""
+    return f"{each.mean.value:.1f}{span(each.mean)}{middle}{crash} ({count(each.mean)}{gap})"
+
+
+def parts(each: Entry) -> list[str]:
+    """Return an entry as short lines: both means, crashes, episodes, the paper's and the verdict, what is missing."""
+    said = " ".join(filter(None, (printed(each), each.verdict)))
+    if each.mean is None:
+        return [part for part in ("–", each.failed, said) if part]
+    middle = "" if each.iqm is None else f"IQM {each.iqm.value:.1f}{span(each.iqm)}"
+    crash = "" if each.crash is None else f"crash {each.crash.value:.2f} "
+    lines = (f"{each.mean.value:.1f}{span(each.mean)}", middle, f"{crash}({count(each.mean)})", said, each.failed)
+    return [part for part in lines if part]
+
+
+def span(found: Estimate) -> str:
+    """Return an interval in brackets after a space; empty where there is none."""
+    return "" if np.isnan(found.low) else f" [{found.low:.1f}, {found.high:.1f}]"
+
+
+def count(found: Estimate) -> str:
+    """Return trainings × spawns, or only the spawns of what was never trained."""
+    return f"{found.training_seeds}×{found.spawns}" if found.training_seeds else f"{found.spawns}"
 
 
 def printed(each: Entry) -> str:
@@ -150,15 +172,14 @@ def short(each: Entry) -> str:
     said = "" if each.printed is None else f" *{each.printed.mean:.1f}*"
     if each.mean is None:
         return f"–{said}"
-    span = "" if np.isnan(each.mean.low) else f" [{each.mean.low:.1f}, {each.mean.high:.1f}]"
     crash = "" if each.crash is None else f" ({each.crash.value:.2f})".replace("(0.", "(.")
-    return f"{each.mean.value:.1f}{span}{crash}{said}"
+    return f"{each.mean.value:.1f}{span(each.mean)}{crash}{said}"
 
 
 def _few(entries: Sequence[Entry]) -> str:
     """Return how many trainings a row has, where they are too few for a verdict."""
-    count = max(each.mean.training_seeds for each in entries if each.mean is not None)
-    return f"({count} training{'s' if count > 1 else ''})" if 0 < count < ENOUGH_SEEDS else ""
+    most = max(each.mean.training_seeds for each in entries if each.mean is not None)
+    return f"({most} training{'s' if most > 1 else ''})" if 0 < most < ENOUGH_SEEDS else ""
 
 
 def compact(table: Table) -> str:
@@ -177,56 +198,6 @@ def compact(table: Table) -> str:
         if missing:
             parts.append(f"Not measured on {scenario}: {'; '.join(missing)}.")
     return "\n\n".join([*parts, *table.notes])
-
-
-_LATEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "&": r"\&",
-        "%": r"\%",
-        "$": r"\$",
-        "#": r"\#",
-        "_": r"\_",
-        "{": r"\{",
-        "}": r"\}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "β": r"$\beta$",
-        "±": r"$\pm$",
-        "×": r"$\times$",
-        "∞": r"$\infty$",
-        "–": "--",
-    }
-)
-
-
-def latex(table: Table | Facts) -> str:
-    """Return a table as LaTeX, in the style of booktabs."""
-
-    def line(cells: Sequence[str]) -> str:
-        return " & ".join(cell.translate(_LATEX) for cell in cells) + r" \\"
-
-    if isinstance(table, Facts):
-        heads, body = list(table.columns), [list(row) for row in table.rows]
-    else:
-        heads = [*table.heads, *table.columns]
-        body = [[*names, *map(_cells, entries)] for names, entries in table.rows]
-    return "\n".join(
-        [
-            r"\begin{table}[t]",
-            r"\centering",
-            rf"\caption{{{table.caption.translate(_LATEX)}}}",
-            rf"\label{{table:{table.id}}}",
-            rf"\begin{{tabular}}{{{'l' * len(heads)}}}",
-            r"\toprule",
-            line(heads),
-            r"\midrule",
-            *map(line, body),
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-        ]
-    )
 
 
 _MARKS = {"inside": "≈", "above": "▲", "below": "▼", "insufficient": "?", "": ""}
@@ -251,17 +222,19 @@ def html(table: Table | Facts) -> Markup:
 
 def _html_entry(each: Entry) -> Markup:
     if each.mean is None:
-        return tag("td", "–", tag("small", each.failed), class_="missing")
+        said = tag("small", f"paper {printed(each)}", class_="line paper") if each.printed else ""
+        return tag("td", "–", tag("small", each.failed), said, class_="missing")
     mean = each.mean
-    parts: list[Markup] = [tag("b", f"{mean.value:.1f}")]
-    if not np.isnan(mean.low):
-        parts.append(tag("small", f" [{mean.low:.1f}, {mean.high:.1f}]"))
+    parts: list[Markup] = [tag("b", f"{mean.value:.1f}"), tag("small", span(mean))]
     if each.iqm is not None:
-        parts.append(tag("small", f"IQM {each.iqm.value:.1f}", class_="line"))
+        parts.append(tag("small", f"IQM {each.iqm.value:.1f}{span(each.iqm)}", class_="line"))
     if each.crash is not None:
         parts.append(tag("small", f"crash {each.crash.value:.2f}", class_="line"))
+    parts.append(tag("small", f"{count(mean)}{'' if mean.training_seeds else ' spawns'}", class_="line"))
     if each.printed is not None:
         parts.append(tag("small", f"paper {printed(each)}", class_="line paper"))
         word = each.verdict if each.verdict != "insufficient" else f"{mean.training_seeds} of {ENOUGH_SEEDS} seeds"
         parts.append(tag("small", f"{_MARKS[each.verdict]} {word}", class_=f"line verdict {each.verdict}"))
+    if each.failed:
+        parts.append(tag("small", each.failed, class_="line gap"))
     return tag("td", *parts, title=mean.unit)

@@ -13,7 +13,7 @@ from rapid.scenarios import PAPER_SCENARIOS, get_scenario
 DATASETS = {"random": "random (D_rand)", "llm": "teacher (D_LLM)", "mixed": "mixed (D*)"}
 READING = (
     "Random and teacher data are of the row's own scenario; D* is of lane-3-density-2 for every row, as in the paper. "
-    "Each cell: mean [95 % interval], interquartile mean, crash share, trainings × spawns; the paper's; verdict."
+    "Each cell: mean and interquartile mean with 95 % intervals, crash share, trainings × spawns; the paper's; verdict."
 )
 
 
@@ -34,8 +34,8 @@ def number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def efficiency(caption: str, found: Sequence[Mapping[str, Any]]) -> Facts:
-    """Return seconds per decision as a table."""
+def efficiency(caption: str, found: Sequence[Mapping[str, Any]], gap: str = "") -> Facts:
+    """Return seconds per decision as a table, and below it what is missing."""
     rows = tuple(
         (
             str(each["agent"]),
@@ -50,6 +50,8 @@ def efficiency(caption: str, found: Sequence[Mapping[str, Any]]) -> Facts:
     if len(rows) > 1:
         slow, fast = (each["median_seconds"] for each in found)
         notes.append(f"The first takes {slow / fast:.0f} times as long as the second.")
+    if gap:
+        notes.append(gap)
     return Facts("efficiency", caption, ("driver", "median", "mean", "decisions"), rows, tuple(notes))
 
 
