@@ -64,6 +64,23 @@ def test_the_text_says_what_was_worst():
     assert worst_text(rows({"none": [20.0], "pgd": [3.0]})) == ""
 
 
+def test_the_text_says_how_much_more_than_always_slower_the_worst_case_earns():
+    attacked = rows({"none": [20, 20, 20], "pgd:loss=ce": [12, 13, 15], "world": [9, 14, 12]})
+    # Always-slower was driven on other spawns as well, which count for nothing here.
+    slower = [replace(row, kind="floor") for row in rows({"none": [7, 8, 9, 100], "lie:to=far": [7, 8, 9]}, "slower")]
+    found, floor = worst_cases([*attacked, *slower])
+    assert found.over_slower is not None
+    assert found.over_slower.value == pytest.approx((9 - 7 + 13 - 8 + 12 - 9) / 3)
+    assert (found.over_slower.low, found.over_slower.high) == (2, 5)
+    assert floor.over_slower is None
+    lines = worst_text([*attacked, *slower]).splitlines()
+    start = lines[1].index("over always-slower [95 %]")
+    assert [line[start:].split("  ")[0] for line in lines[3:5]] == ["3.3 [2.0, 5.0]", "–"]
+    # An agent that is only called so is not that driver; without the driver there is nothing to say.
+    named = [replace(row, agent="slower", kind="learned") for row in attacked]
+    assert {case.over_slower for case in worst_cases([*attacked, *named])} == {None}
+
+
 def test_a_sweep_is_a_table_and_a_plot():
     sizes = (0.005, 0.02, 0.1)
     found = rows({"none": [20.0, 21.0]} | {

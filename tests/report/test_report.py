@@ -72,6 +72,9 @@ def test_the_worst_case_has_a_table_and_over_sizes_a_plot() -> None:
     content = page(ReportData(title="t", rows=pair, trained=False))
     assert 'id="worst"' in content
     assert "most often the worst" in content
+    with_floor = page(ReportData(title="t", rows=[*pair, *rows("slower", kind="floor")]))
+    assert "over always-slower [95 %]" in with_floor
+    assert "95 % interval 0.0 to 0.0; 8 spawns" in with_floor
     # What was not trained has no curves to miss.
     assert "No training was recorded" not in content
     assert plot(ReportData(title="t", rows=pair)) == []

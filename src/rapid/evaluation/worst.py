@@ -12,12 +12,14 @@ from typing import NamedTuple
 from rapid.attacks.spec import AttackSpec, parse_attack
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow, column
-from rapid.evaluation.statistics import RESAMPLES, Estimate, estimate
-from rapid.evaluation.summary import aligned, label_of, with_interval
+from rapid.evaluation.statistics import RESAMPLES, Estimate, estimate, paired_difference
+from rapid.evaluation.summary import CLEAN, NOT_RUN, aligned, label_of, with_interval
 from rapid.scenarios import get_scenario
 
 UNBOUNDED = ("none", "gaussian")
 """Kinds of attacks that belong to no ball."""
+OVER_SLOWER = "over always-slower [95 %]"
+"""Heading of what an agent earns more than the driver that always brakes."""
 
 
 class Threat(NamedTuple):
@@ -56,6 +58,8 @@ class Worst:
     """For each training and spawn the episode that earned least; `attack` says under which."""
     episode_return: Estimate
     crashed: Estimate
+    over_slower: Estimate | None = None
+    """The return less that of always-slower on the same spawns; None if that was not driven, or is this agent."""
 
     @property
     def worst_attack(self) -> str:
@@ -96,6 +100,7 @@ def worst_cases(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[
     threats = {attack: threat_of(attack) for attack in dict.fromkeys(row.attack for row in rows)}
     members = Counter(threat for threat in threats.values() if threat is not None)
     found: list[Worst] = []
+    slower = _slower(rows)
     for scenario, agent in dict.fromkeys((row.scenario, row.agent) for row in rows):
         own = [row for row in rows if (row.scenario, row.agent) == (scenario, agent)]
         for threat in (threat for threat, count in members.items() if count > 1):
@@ -106,8 +111,17 @@ def worst_cases(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[
             complete = _measured_under_all(chosen)
             worst = [row for row in worst_rows(chosen) if (row.training_seed, row.seed) in complete]
             if worst:
-                found.append(_worst(scenario, agent, threat, attacks, worst, resamples))
+                floor = [row for row in slower if row.scenario == scenario and row.agent != agent]
+                found.append(_worst(scenario, agent, threat, attacks, worst, floor, resamples))
     return found
+
+
+def _slower(rows: Sequence[EpisodeRow]) -> list[EpisodeRow]:
+    """Return one row of always-slower for each scenario and spawn; it does not look, so no attack changes any."""
+    driven = [row for row in rows if row.kind == "floor" and row.agent == "slower"]
+    # Those without attack come first, as there every spawn was driven.
+    ordered = sorted(driven, key=lambda row: row.attack != CLEAN)
+    return list({(row.scenario, row.seed): row for row in reversed(ordered)}.values())
 
 
 def _measured_under_all(rows: Sequence[EpisodeRow]) -> set[tuple[int | None, int]]:
@@ -117,13 +131,27 @@ def _measured_under_all(rows: Sequence[EpisodeRow]) -> set[tuple[int | None, int
 
 
 def _worst(
-    scenario: str, agent: str, threat: Threat, attacks: tuple[str, ...], rows: Sequence[EpisodeRow], resamples: int
+    scenario: str,
+    agent: str,
+    threat: Threat,
+    attacks: tuple[str, ...],
+    rows: Sequence[EpisodeRow],
+    slower: Sequence[EpisodeRow],
+    resamples: int,
 ) -> Worst:
     seeds, trainings = [row.seed for row in rows], [row.training_seed for row in rows]
     returns, crashes = (
         estimate(column(rows, name), seeds, trainings, "mean", resamples) for name in ("episode_return", "crashed")
     )
-    return Worst(scenario, agent, threat, attacks, tuple(rows), returns, crashes)
+    over = paired_difference(
+        column(rows, "episode_return"),
+        seeds,
+        column(slower, "episode_return"),
+        [row.seed for row in slower],
+        trainings,
+        resamples=resamples,
+    )
+    return Worst(scenario, agent, threat, attacks, tuple(rows), returns, crashes, over if over.episodes else None)
 
 
 def worst_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
@@ -132,11 +160,12 @@ def worst_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
     cases = worst_cases(rows, resamples)
     for scenario, threat in dict.fromkeys((case.scenario, case.threat) for case in cases):
         here = [case for case in cases if (case.scenario, case.threat) == (scenario, threat)]
-        lines = [["worst case", "return", "crash %", "attacks", "most often"]]
+        lines = [["worst case", "return", OVER_SLOWER, "crash %", "attacks", "most often"]]
         lines += [
             [
                 label_of(case.agent),
                 with_interval(case.episode_return),
+                NOT_RUN if case.over_slower is None else with_interval(case.over_slower),
                 with_interval(case.crashed, 0, 100),
                 str(len(case.attacks)),
                 case.worst_attack,

@@ -17,7 +17,7 @@ from rapid.evaluation.summary import (
     number,
     units,
 )
-from rapid.evaluation.worst import Worst
+from rapid.evaluation.worst import OVER_SLOWER, Worst
 from rapid.experiments.paper import PaperResult
 from rapid.pages.episodes import ACTION_WORDS
 from rapid.pages.markup import Markup, tag, text
@@ -100,6 +100,7 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
     heads = [
         ("agent", "", "text"),
         ("return", "mean over spawns of the least return under any of the attacks", "number"),
+        (OVER_SLOWER, "return less that of the driver that always brakes, on the same spawns", "number"),
         ("crashed", "share of these worst episodes that end in a crash", "number"),
         ("attacks", "how many attacks were made on it", "number"),
         ("most often the worst", "the attack under which the most spawns earned least", "text"),
@@ -110,6 +111,7 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
             "tr",
             tag("th", label_of(case.agent), scope="row", class_="name", data_value=label_of(case.agent).lower()),
             _cell(case.episode_return, bar=span),
+            _none_cell() if case.over_slower is None else _cell(case.over_slower),
             _cell(case.crashed, 0, 100, " %"),
             tag("td", len(case.attacks), data_value=len(case.attacks)),
             tag("td", case.worst_attack, data_value=case.worst_attack),
@@ -195,6 +197,11 @@ def _cell(
     return tag("td", *inside, data_value=value, title=interval_words(of, digits, scale, suffix))
 
 
+def _none_cell() -> Markup:
+    """Return a cell of what there is no number for."""
+    return tag("td", tag("span", NOT_RUN, class_="value none"))
+
+
 def _plain_cell(of: Estimate, digits: int) -> Markup:
     """Return a cell of a number that was measured once for all episodes, so that an interval would mean nothing."""
     value = None if math.isnan(of.value) else of.value
@@ -225,7 +232,7 @@ def _interval_bar(of: Estimate, span: tuple[float, float]) -> Markup:
 
 def _paper_cell(paper: PaperResult | None) -> Markup:
     if paper is None:
-        return tag("td", tag("span", NOT_RUN, class_="value none"))
+        return _none_cell()
     words = f"the paper prints {paper.mean:.2f} ± {paper.spread:.2f}"
     inside = (tag("span", f"{paper.mean:.2f}", class_="value"), tag("small", f"± {paper.spread:.2f}"))
     return tag("td", *inside, data_value=paper.mean, title=words, class_="paper")
