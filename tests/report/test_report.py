@@ -79,6 +79,14 @@ def test_the_worst_case_has_a_table_and_over_sizes_a_plot() -> None:
     assert "No training was recorded" not in content
     assert plot(ReportData(title="t", rows=pair)) == []
     assert 'id="worst"' not in page(full())  # two attacks that are not of the same size
+    assert "within each threat" not in content
+    four = [("RAPID", "none"), *((f"<b>{n}", f"{kind}:radius=0.1{more}")
+            for n in range(2) for kind in ("pgd", "world") for more in ("", ",ego=trusted"))]  # fmt: skip
+    threats = page(ReportData(title="t", rows=[row for agent, attack in four for row in rows(agent, attack)]))
+    Reader(threats)
+    assert f"{SCENARIO}, within each threat" in threats
+    assert ">presence masked, ego row trusted</button>" in threats
+    assert "<b>0" not in threats
     kinds = ("pgd", "directed")
     swept = [
         *rows("RAPID"),

@@ -16,6 +16,7 @@ from rapid.report.tables import (
     caption,
     interval_words,
     results_table,
+    threats_table,
     worst_table,
 )
 from rapid.scenarios import get_scenario
@@ -206,6 +207,9 @@ def worst(run: ReportData) -> Markup:
     if not cases:
         return Markup("")
     parts: list[Markup] = []
+    for scenario in dict.fromkeys(case.scenario for case in cases):
+        if table := threats_table([case for case in cases if case.scenario == scenario], run.lead):
+            parts += [tag("h3", f"{scenario}, within each threat"), table]
     for scenario, threat in dict.fromkeys((case.scenario, case.threat) for case in cases):
         here = [case for case in cases if (case.scenario, case.threat) == (scenario, threat)]
         parts += [tag("h3", f"{scenario}, within {threat.words(get_scenario(scenario).lanes)}")]

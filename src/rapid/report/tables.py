@@ -17,7 +17,7 @@ from rapid.evaluation.summary import (
     number,
     units,
 )
-from rapid.evaluation.worst import OVER_SLOWER, Worst
+from rapid.evaluation.worst import OVER_SLOWER, Worst, threats_of
 from rapid.experiments.paper import PaperResult
 from rapid.pages.episodes import ACTION_WORDS
 from rapid.pages.markup import Markup, tag, text
@@ -109,7 +109,7 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
     body = [
         tag(
             "tr",
-            tag("th", label_of(case.agent), scope="row", class_="name", data_value=label_of(case.agent).lower()),
+            _agent(case.agent),
             _cell(case.episode_return, bar=span),
             _none_cell() if case.over_slower is None else _cell(case.over_slower),
             _cell(case.crashed, 0, 100, " %"),
@@ -119,6 +119,24 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
         )
         for case in cases
     ]
+    return _table(heads, body)
+
+
+def threats_table(cases: Sequence[Worst], lead: str) -> Markup:
+    """Return the worst cases of one scenario in one table, a column a threat; nothing where none is needed."""
+    threats = threats_of(cases)
+    if not threats:
+        return Markup("")
+    top = max(case.episode_return.value for case in cases)
+    heads = [("agent", "", "text"), *((words, "worst case within this threat", "number") for words in threats.values())]
+    body: list[Markup] = []
+    for agent in dict.fromkeys(case.agent for case in cases):
+        own = {case.threat: case for case in cases if case.agent == agent}
+        cells = [
+            _attack_cell(AttackCell(case.episode_return, case.crashed), None, top) if case else _none_cell()
+            for case in map(own.get, threats)
+        ]
+        body.append(tag("tr", _agent(agent), *cells, class_="lead" if agent == lead else None))
     return _table(heads, body)
 
 
@@ -171,6 +189,10 @@ def _name(row: SummaryRow, lead: str) -> Markup:
     if row.agent == lead:
         badge = [tag("span", "this run", class_="badge lead")]
     return tag("th", row.label, *badge, scope="row", class_="name", data_value=row.label.lower())
+
+
+def _agent(name: str) -> Markup:
+    return tag("th", label_of(name), scope="row", class_="name", data_value=label_of(name).lower())
 
 
 def interval_words(of: Estimate, digits: int = 1, scale: float = 1.0, suffix: str = "") -> str:
