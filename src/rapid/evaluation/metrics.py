@@ -60,6 +60,9 @@ class EpisodeRow:
     """Whether the agent has a network that a gradient attack can use."""
     gradient_attack: bool = False
     """Whether the attack needs the agent's gradient."""
+    hit: str = ""
+    """Where the car was that the ego touched: `ahead`, `beside` or `behind`; empty without a crash, and in rows of
+    earlier versions."""
 
     @property
     def progress_return(self) -> float:
@@ -93,9 +96,12 @@ SCHEMA = pa.schema(
         ("has_network", pa.bool_()),
         ("gradient_attack", pa.bool_()),
         ("commit", pa.string()),
+        ("hit", pa.string()),
     ]
 )
 """Columns of the Parquet file; a share of actions is one column each."""
+_LATER = ("hit",)
+"""Columns of text that files of earlier versions lack; there they are empty."""
 
 
 def _nullable(value: Any) -> Any:
@@ -130,6 +136,9 @@ def rows_of_table(table: pa.Table, path: str | os.PathLike[str]) -> list[Episode
     Raises:
         RapidError: it lacks a column.
     """
+    for name in _LATER:
+        if name not in table.column_names:
+            table = table.append_column(name, pa.array([""] * len(table), pa.string()))
     try:
         table = table.select(SCHEMA.names).cast(SCHEMA)
     except (KeyError, ValueError, pa.ArrowException) as error:

@@ -53,6 +53,8 @@ class Episodes:
     kind: Kind = "learned"
     has_network: bool = False
     gradient_attack: bool = False
+    hit_E: tuple[str, ...] = ()
+    """What was hit in each episode that crashed, as in `EpisodeRow`; nothing at all is nothing known."""
     recordings: list[Recording] = field(default_factory=list[Recording])
 
     def __len__(self) -> int:
@@ -81,6 +83,7 @@ class Episodes:
                 kind=self.kind,
                 has_network=self.has_network,
                 gradient_attack=self.gradient_attack,
+                hit=self.hit_E[i] if self.hit_E else "",
             )
             for i in range(len(self))
         ]
@@ -164,6 +167,7 @@ def run_episodes(
         kind=kind_of(agent),
         has_network=network_of(agent) is not None,
         gradient_attack=resolved is not None and resolved.needs_gradient,
+        hit_E=tuple(hit for part in parts for hit in part.hit_B),
     )
     for part in parts:
         episodes.recordings.extend(part.recordings(_name(agent), scenario, attack_name))

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from rapid.agents.open import PLANNERS, check_road, open_agent
@@ -51,7 +52,8 @@ PLANNER = "planner"
 RECORDED = 4
 """Episodes of the adapted agent, and of the teacher, that the report can play."""
 CRASHES = 2
-"""Crashes of an adapted agent under each attack that the report can play; of other learned agents, one."""
+"""Crashes of an adapted agent under each attack that the report can play; of other learned agents and of scripted
+drivers, one."""
 
 
 def compare(
@@ -285,12 +287,24 @@ def _is_adapted(agent: Any) -> bool:
 
 
 def crashes_of(config: Config, agent: Any, driven: Sequence[tuple[AttackSpec, Episodes]]) -> list[Recording]:
-    """Drive the first crashes of a learned agent again, under each attack, to keep what happened step by step."""
+    """Drive the first crashes of an agent again, under each attack, to keep what happened step by step.
+
+    Of learned agents and of scripted drivers, that is. A scripted driver that drove alike under another attack, because
+    it does not see what was done, is kept once.
+    """
     found: list[Recording] = []
+    alike: set[tuple[int, int, float]] = set()
     for attack, of in driven:
         known = {recording.seed for recording in of.recordings[:RECORDED]}
-        seeds = [int(seed) for seed in of.seed_E[of.crashed_E] if int(seed) not in known]
-        seeds = seeds[: CRASHES if _is_adapted(agent) else 1] if of.kind == "learned" else []
+        if of.kind not in ("learned", "floor"):
+            continue
+        crashed = [
+            (int(of.seed_E[i]), int(of.length_E[i]), float(of.return_E[i]))
+            for i in np.flatnonzero(of.crashed_E)
+            if int(of.seed_E[i]) not in known
+        ][: CRASHES if _is_adapted(agent) else 1]
+        seeds = [episode[0] for episode in crashed if of.kind == "learned" or episode not in alike]
+        alike |= set(crashed)
         if seeds:
             again = run_episodes(
                 agent,

@@ -6,9 +6,10 @@ from pathlib import Path
 from rapid.evaluation.summary import summarize, summary_text
 from rapid.files import write_text
 from rapid.pages import PLAYER, fill_page
-from rapid.pages.episodes import ACTION_WORDS, side_by_side
+from rapid.pages.episodes import ACTION_WORDS, in_order, side_by_side
 from rapid.pages.markup import Markup, join, tag
 from rapid.report import sections
+from rapid.report.crashes import crashes
 from rapid.report.curves import charts
 from rapid.report.data import ReportData
 from rapid.report.routing import routing
@@ -47,6 +48,7 @@ def page(run: ReportData) -> str:
                 "how much the adapter's. Space plays and pauses, the arrow keys step, c goes to the crash.",
                 "No episode was recorded.",
             ),
+            crashes(run.rows, in_order(run.recordings)),
             sections.attacks(run, summaries),
             sections.worst(run),
             *(_training(run, bool(curves), lanes) if run.trained else ()),

@@ -69,7 +69,7 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
                 class_=_row_class(row, lead),
             )
         )
-    return _table(heads, body)
+    return table(heads, body)
 
 
 def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
@@ -92,7 +92,7 @@ def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
             for attack, cell in {"none": clean, **row.attacks}.items()
         ]
         body.append(tag("tr", _name(row, lead), *cells, class_=_row_class(row, lead)))
-    return _table(heads, body)
+    return table(heads, body)
 
 
 def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
@@ -119,7 +119,7 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
         )
         for case in cases
     ]
-    return _table(heads, body)
+    return table(heads, body)
 
 
 def threats_table(cases: Sequence[Worst], lead: str) -> Markup:
@@ -137,7 +137,7 @@ def threats_table(cases: Sequence[Worst], lead: str) -> Markup:
             for case in map(own.get, threats)
         ]
         body.append(tag("tr", _agent(agent), *cells, class_="lead" if agent == lead else None))
-    return _table(heads, body)
+    return table(heads, body)
 
 
 def attack_sentences(attacks: Sequence[str], scenario: Scenario) -> list[str]:
@@ -160,7 +160,8 @@ def action_legend() -> Markup:
     return tag("p", *parts, class_="legend")
 
 
-def _table(heads: Sequence[tuple[str, str, str]], body: Sequence[Markup]) -> Markup:
+def table(heads: Sequence[tuple[str, str, str]], body: Sequence[Markup]) -> Markup:
+    """Return a table that can be sorted, of heads (label, help, what to sort by) and rows."""
     cells: list[Markup] = []
     for label, help_text, sort in heads:
         inside = tag("button", label, type="button") if sort != "none" else text(label)
@@ -175,8 +176,8 @@ def _table(heads: Sequence[tuple[str, str, str]], body: Sequence[Markup]) -> Mar
             )
         )
     head = tag("thead", tag("tr", *cells))
-    table = tag("table", head, tag("tbody", *body), class_="sortable")
-    return tag("div", table, class_="scroll", tabindex="0", role="region", aria_label="table")
+    inner = tag("table", head, tag("tbody", *body), class_="sortable")
+    return tag("div", inner, class_="scroll", tabindex="0", role="region", aria_label="table")
 
 
 def _row_class(row: SummaryRow, lead: str) -> str:
