@@ -51,10 +51,11 @@ def test_every_crash_of_an_episode_says_what_was_hit(tmp_path: Path) -> None:
 
 
 def test_rows_of_earlier_versions_are_read(tmp_path: Path) -> None:
-    save_rows(tmp_path / "rows.parquet", [replace(ROW, hit="ahead")])
-    table = pq.read_table(tmp_path / "rows.parquet").drop_columns(["hit"])
+    save_rows(tmp_path / "rows.parquet", [replace(ROW, hit="ahead", origin="rapid")])
+    assert load_rows(tmp_path / "rows.parquet")[0].origin == "rapid"
+    table = pq.read_table(tmp_path / "rows.parquet").drop_columns(["hit", "origin"])
     pq.write_table(table, tmp_path / "old.parquet")
-    assert [row.hit for row in load_rows(tmp_path / "old.parquet")] == [""]
+    assert [(row.hit, row.origin) for row in load_rows(tmp_path / "old.parquet")] == [("", "")]
 
 
 def test_crashes_are_counted_by_scenario_attack_and_agent() -> None:

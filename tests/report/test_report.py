@@ -185,15 +185,26 @@ def test_unwritable_place(tmp_path: Path) -> None:
 
 
 def test_verdict_needs_five_trainings() -> None:
-    one = ReportData(title="x", rows=rows("RAPID", training_seed=0))
+    one = ReportData(title="x", rows=rows("mine", training_seed=0, origin="rapid"))
     assert "insufficient" in page(one)
-    many = [row for seed in range(5) for row in rows("RAPID", training_seed=seed)]
+    many = [row for seed in range(5) for row in rows("RAPID", training_seed=seed, origin="rapid")]
     assert "our interval lies" in page(ReportData(title="x", rows=many))
 
 
 def test_paper_is_not_beside_another_reward() -> None:
-    other = [replace(row, scenario=f"{SCENARIO}:progress") for row in rows("RAPID", training_seed=0)]
+    other = [replace(row, scenario=f"{SCENARIO}:progress") for row in rows("RAPID", origin="rapid")]
     assert "20.42" not in page(ReportData(title="x", rows=other))
+
+
+def test_the_paper_is_beside_what_was_trained_here_whatever_it_is_called() -> None:
+    def shown(**changes: Any) -> bool:
+        return "20.42" in page(ReportData(title="x", rows=rows(**changes)))
+
+    assert shown(agent="a name of my own", origin="rapid")
+    assert not shown(agent="RAPID", origin="other")
+    # Rows of earlier versions have names alone; a model of other origin has no network that is known here.
+    assert shown(agent="RAPID", has_network=True)
+    assert not shown(agent="RAPID")
 
 
 def test_uniform_policy_is_marked_on_the_robust_curve_only() -> None:

@@ -63,6 +63,19 @@ class EpisodeRow:
     hit: str = ""
     """Where the car was that the ego touched: `ahead`, `beside` or `behind`; empty without a crash, and in rows of
     earlier versions."""
+    origin: str = ""
+    """What the agent is, whatever it is called (:func:`rapid.agents.origin.origin_of`); empty in rows of earlier
+    versions."""
+
+    @property
+    def what(self) -> str:
+        """`origin`, or what rows of earlier versions let tell: by their names, which a run itself gave its agents."""
+        if self.origin:
+            return self.origin
+        if self.kind in ("floor", "planner"):
+            return self.agent
+        # A model of other origin has no network that this package knows.
+        return _NAMED.get(self.agent, "") if self.kind == "learned" and self.has_network else ""
 
     @property
     def progress_return(self) -> float:
@@ -74,6 +87,13 @@ class EpisodeRow:
         return self.length * self.mean_speed / PROGRESS_SPEED + PROGRESS_CRASH * self.crashed
 
 
+_NAMED = {
+    "RAPID": "rapid",
+    "distilled": "distilled",
+    "offline DQN": "offline-dqn",
+    "online DQN": "online-dqn",
+}
+"""What `rapid run` calls the agents that it trains, and by which method."""
 _SHARES = tuple(f"share_{action.lower()}" for action in ACTIONS)
 
 SCHEMA = pa.schema(
@@ -97,10 +117,11 @@ SCHEMA = pa.schema(
         ("gradient_attack", pa.bool_()),
         ("commit", pa.string()),
         ("hit", pa.string()),
+        ("origin", pa.string()),
     ]
 )
 """Columns of the Parquet file; a share of actions is one column each."""
-_LATER = ("hit",)
+_LATER = ("hit", "origin")
 """Columns of text that files of earlier versions lack; there they are empty."""
 
 

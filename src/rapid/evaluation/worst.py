@@ -123,14 +123,14 @@ def worst_cases(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[
             complete = _measured_under_all(chosen)
             worst = [row for row in worst_rows(chosen) if (row.training_seed, row.seed) in complete]
             if worst:
-                floor = [row for row in slower if row.scenario == scenario and row.agent != agent]
+                floor = [row for row in slower if row.scenario == scenario and own[0].what != "slower"]
                 found.append(_worst(scenario, agent, threat, attacks, worst, floor, resamples))
     return found
 
 
 def _slower(rows: Sequence[EpisodeRow]) -> list[EpisodeRow]:
     """Return one row of always-slower for each scenario and spawn; it does not look, so no attack changes any."""
-    driven = [row for row in rows if row.kind == "floor" and row.agent == "slower"]
+    driven = [row for row in rows if row.kind == "floor" and row.what == "slower"]
     # Those without attack come first, as there every spawn was driven.
     ordered = sorted(driven, key=lambda row: row.attack != CLEAN)
     return list({(row.scenario, row.seed): row for row in reversed(ordered)}.values())

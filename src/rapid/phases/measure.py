@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from rapid.agents.open import PLANNERS, check_road, open_agent
+from rapid.agents.origin import origin_of
 from rapid.agents.q_agent import QAgent
 from rapid.attacks import get_attack
 from rapid.attacks.adversary import fingerprint, save_adversary, train_adversary
@@ -25,7 +26,7 @@ from rapid.errors import DamagedError, RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, explained_by, load_recordings, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
-from rapid.evaluation.summary import summary_text
+from rapid.evaluation.summary import label_of, summary_text
 from rapid.evaluation.worst import worst_text
 from rapid.files import sha256, write_text
 from rapid.networks.q_network import QNetwork
@@ -80,7 +81,12 @@ def compare(
     opened = {spec: _open(config, spec, config.scenario) for spec in specs}
     names = [_checked_name(config, opened[spec]) for spec in specs]
     # Two trainings of the same name would fall into one row of the table.
-    labels = {spec: f"{name} ({spec})" for spec, name in zip(specs, names, strict=True) if names.count(name) > 1}
+    # And what is only called as one of the drivers would be shown as that driver.
+    labels = {
+        spec: f"{name} ({spec})"
+        for spec, name in zip(specs, names, strict=True)
+        if names.count(name) > 1 or (label_of(name) != name and origin_of(opened[spec]) != name)
+    }
     files = [Path(spec) / "config.json" if Path(spec).is_dir() else Path(spec) for spec in specs]
     settings = to_dict(without_place(config).evaluate)
     request = {

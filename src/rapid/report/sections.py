@@ -115,7 +115,7 @@ def results(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
 
 
 def _verdict(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
-    ours = [row for row in summaries if row.agent == run.lead and paper_return(row.agent, get_scenario(row.scenario))]
+    ours = [row for row in summaries if row.agent == run.lead and paper_return(row.origin, get_scenario(row.scenario))]
     if not ours:
         return Markup("")
     trainings = min(row.metrics["episode_return"].training_seeds for row in ours)
@@ -128,7 +128,7 @@ def _verdict(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
         )
     words: list[str] = []
     for row in ours:
-        of, paper = row.metrics["episode_return"], paper_return(row.agent, get_scenario(row.scenario))
+        of, paper = row.metrics["episode_return"], paper_return(row.origin, get_scenario(row.scenario))
         assert paper is not None
         where = "above" if of.low > paper.mean else "below" if of.high < paper.mean else "around"
         words.append(f"{row.scenario}: our interval lies {where} the paper's mean of {paper.mean:.2f}.")
@@ -138,7 +138,7 @@ def _verdict(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
 def _tiles(lead: SummaryRow, rows: Sequence[SummaryRow]) -> Markup:
     """Return the few numbers of the agent that the run is about."""
     of = lead.metrics
-    paper = paper_return(lead.agent, get_scenario(lead.scenario))
+    paper = paper_return(lead.origin, get_scenario(lead.scenario))
     tiles = [
         _tile("return", number(of["episode_return"].value), interval_words(of["episode_return"])),
         _tile(
@@ -151,8 +151,8 @@ def _tiles(lead: SummaryRow, rows: Sequence[SummaryRow]) -> Markup:
     ]
     if paper is not None:
         tiles.insert(1, _tile("the paper's return", f"{paper.mean:.2f}", f"± {paper.spread:.2f}, as printed"))
-    slower = next((row for row in rows if row.agent == "slower"), None)
-    planner = next((row for row in rows if row.agent == "planner"), None)
+    slower = next((row for row in rows if row.origin == "slower"), None)
+    planner = next((row for row in rows if row.origin == "planner"), None)
     if slower is not None and planner is not None:
         floor, top = slower.metrics["episode_return"].value, planner.metrics["episode_return"].value
         ours = of["episode_return"].value

@@ -31,7 +31,7 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
     """Return the table of one scenario, without attack."""
     scenario = get_scenario(rows[0].scenario)
     span = _span([row.metrics["episode_return"] for row in rows])
-    has_paper = any(paper_return(row.agent, scenario) for row in rows)
+    has_paper = any(paper_return(row.origin, scenario) for row in rows)
     has_other = scenario.reward != "progress"
     heads = [
         ("agent", "", "text"),
@@ -50,7 +50,7 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
     body: list[Markup] = []
     for row in rows:
         of = row.metrics
-        paper = paper_return(row.agent, scenario)
+        paper = paper_return(row.origin, scenario)
         body.append(
             tag(
                 "tr",
@@ -88,7 +88,7 @@ def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
     for row in rows:
         clean = AttackCell(row.metrics["episode_return"], row.metrics["crashed"])
         cells = [
-            _attack_cell(cell, paper_return(row.agent, scenario, attack), top)
+            _attack_cell(cell, paper_return(row.origin, scenario, attack), top)
             for attack, cell in {"none": clean, **row.attacks}.items()
         ]
         body.append(tag("tr", _name(row, lead), *cells, class_=_row_class(row, lead)))
