@@ -107,7 +107,7 @@ def test_crashes_are_counted_by_attack_and_agent_and_lead_to_what_was_kept() -> 
     ]  # fmt: skip
     content = page(ReportData(title="t", rows=driven, recordings=[kept[0], recording(), kept[1]]))
     Reader(content)
-    found = content[content.index('id="crashes"') : content.index('id="attacks"')]
+    found = content[content.index('id="crashes"') : content.index('id="watch"')]
     cells = re.findall(r"<td.*?</td>", found)
     words = [re.sub(r"<[^>]*>", " ", cell).split() for cell in cells]
     assert [" ".join(each) for each in words] == [

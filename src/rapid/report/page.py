@@ -39,6 +39,7 @@ def page(run: ReportData) -> str:
         [
             sections.head(run),
             sections.results(run, summaries),
+            crashes(run.rows, in_order(run.recordings)),
             sections.drawn(
                 "watch",
                 "Watch it drive",
@@ -48,7 +49,6 @@ def page(run: ReportData) -> str:
                 "how much the adapter's. Space plays and pauses, the arrow keys step, c goes to the crash.",
                 "No episode was recorded.",
             ),
-            crashes(run.rows, in_order(run.recordings)),
             sections.attacks(run, summaries),
             sections.worst(run),
             *(_training(run, bool(curves), lanes) if run.trained else ()),
