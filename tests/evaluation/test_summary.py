@@ -88,14 +88,17 @@ def test_who_is_ahead_of_the_lead_is_said_plainly() -> None:
         pairs = enumerate(returns)
         return [replace(row, seed=seed, episode_return=value, attack=attack) for seed, value in pairs]
 
+    def lead(returns: list[float], attack: str = "none") -> list[EpisodeRow]:
+        return [replace(row, origin="rapid") for row in driven("RAPID", returns, attack)]
+
     spread = [float(number % 3) for number in range(12)]
     rows = [
-        *driven("RAPID", [20 + value for value in spread]),
+        *lead([20 + value for value in spread]),
         *driven("slower", [21 + value for value in spread], kind="floor"),
         *driven("online DQN", [20 + value + (-1) ** number * 5 + 0.1 for number, value in enumerate(spread)]),
         *driven("offline DQN", [10.0] * 12),
         *driven("smollm2-135m", [30.0] * 12, kind="teacher"),
-        *driven("RAPID", [10 + value for value in spread], "pgd"),
+        *lead([10 + value for value in spread], "pgd"),
         *driven("offline DQN", [15 + value for value in spread], "pgd"),
     ]
     clean, attacked = ahead_of(rows)
@@ -107,10 +110,25 @@ def test_who_is_ahead_of_the_lead_is_said_plainly() -> None:
         "Ahead of RAPID in lane-3-density-2, under pgd: always-slower by 11.00 [11.00, 11.00]; off"
     )
     assert all(line in summary_text(rows) for line in (clean, attacked))
-    assert ahead_of(driven("RAPID", [20.0] * 3) + driven("idle", [19.0] * 3, kind="floor")) == [
+    assert ahead_of(lead([20.0] * 3) + driven("idle", [19.0] * 3, kind="floor")) == [
         "Ahead of RAPID in lane-3-density-2, without attack: no floor and no baseline."
     ]
     assert ahead_of(driven("slower", spread)) == []
+    # Who leads, and who does not look, is what they are; names only change what is shown.
+    renamed = {"RAPID": "mine", "slower": "RAPID"}
+    known = [replace(row, origin=row.origin or row.agent) for row in rows if row.agent in renamed]
+    assert ahead_of([replace(row, agent=renamed[row.agent]) for row in known])[1] == (
+        "Ahead of mine in lane-3-density-2, under pgd: RAPID by 11.00 [11.00, 11.00]."
+    )
+    # Of earlier versions there are names alone: those that a run gave to what it trained.
+    old = [replace(row, origin="", has_network=True) for row in known]
+    assert ahead_of(old)[0].startswith("Ahead of RAPID in lane-3-density-2, without attack: always-slower")
+
+
+def test_a_plan_of_ones_own_drives_under_every_attack_as_without() -> None:
+    plan = [replace(row, origin="blind:5,2,4") for row in rows_of("my plan", kind="floor")]
+    mine = [replace(row, origin="rapid", episode_return=1.0) for row in rows_of("mine", "pgd")]
+    assert ahead_of([*plan, *mine])[0].startswith("Ahead of mine in lane-3-density-2, under pgd: my plan by 11.50 [")
 
 
 @pytest.mark.parametrize("driver", ["rule", "faster", "random"])

@@ -1,11 +1,12 @@
 """The worst case over attacks, and the sweep over sizes."""
 
+import re
 from dataclasses import replace
 
 import pytest
 
 from rapid.evaluation.metrics import EpisodeRow
-from rapid.evaluation.worst import measured_under_all, threat_of, worst_cases, worst_rows, worst_text
+from rapid.evaluation.worst import measured_under_all, threat_of, threats_of, worst_cases, worst_rows, worst_text
 from rapid.report.sweep import sweep_figure, sweep_text
 
 BASE = EpisodeRow("lane-3-density-2", "a", 0, "none", 20.0, 30, False, 20.0, 600.0, 0, 3.0, (0.2,) * 5)
@@ -73,6 +74,61 @@ def test_the_text_says_what_was_worst():
     assert "9.0" in text
     assert text.splitlines()[3].split()[-1] == "world"
     assert worst_text(rows({"none": [20.0], "pgd": [3.0]})) == ""
+
+
+def test_several_threats_stand_side_by_side_in_one_table():
+    threats = {"": 9.0, "ego=trusted": 8.0, "presence=free": 4.0, "presence=free,ego=trusted": 7.0}
+    attacks = {f"{kind}:radius=0.05{',' * bool(more)}{more}": [value + place, value]
+               for more, value in threats.items() for place, kind in enumerate(("world", "directed"))}  # fmt: skip
+    found = rows({"none": [20.0, 21.0], **attacks})
+    text = worst_text([*found, *rows({"none": [5.0, 5.0], "lie:radius=0.05": [5.0, 5.0]}, "blind")])
+    head, _, first, second = text.split("\n\n")[0].splitlines()[1:]
+    words = ["presence masked, ego row free", "presence masked, ego row trusted",
+             "presence free, ego row free", "presence free, ego row trusted"]  # fmt: skip
+    assert re.split(r"  +", head) == ["worst case", *words]
+    cells = [first[head.index(word) :].split("  ")[0] for word in words]
+    assert [cell.split(" ")[0] for cell in cells] == ["9.0", "8.0", "4.0", "7.0"]
+    assert [cell.split(", ")[-1] for cell in cells] == ["crashed 0%"] * 2 + ["crashed 100%", "crashed 0%"]
+    assert [second[head.index(word) :].split("  ")[0] for word in words[1:]] == ["–"] * 3
+    # One threat has its own block alone, sizes have a table of their own, and other sizes are named in the heads.
+    assert "within each threat" not in worst_text(rows({"none": [20.0], "world": [9.0], "directed": [8.0]}))
+    assert threats_of(worst_cases(rows(sized(0.01, 0.02, 0.05)))) == {}
+    assert [words.split(" ")[0] for words in threats_of(worst_cases(rows(sized(0.01, 0.05)))).values()] == [
+        "0.01",
+        "0.05",
+    ]
+
+
+def sized(*radii: float) -> dict[str, list[float]]:
+    return {"none": [20.0], **{f"{kind}:radius={r}": [9.0] for r in radii for kind in ("world", "directed")}}
+
+
+def test_what_moves_one_feature_alone_is_another_threat():
+    along = [f"{kind}:radius=0.05,moves=along" for kind in ("world", "directed")]
+    found = rows(
+        {"none": [20.0], "world:radius=0.05": [9.0], "directed:radius=0.05": [8.0], **{key: [3.0] for key in along}}
+    )
+    free, only = worst_cases(found)
+    assert (free.episode_return.value, only.episode_return.value) == (8, 3)
+    assert only.threat.words(3) == "0.05 (10 m along)"
+    assert list(threats_of([free, only]).values())[1] == "presence masked, ego row free, of cars only x"
+
+
+def test_the_text_says_how_much_more_than_always_slower_the_worst_case_earns():
+    attacked = rows({"none": [20, 20, 20], "pgd:loss=ce": [12, 13, 15], "world": [9, 14, 12]})
+    # Always-slower was driven on other spawns as well, which count for nothing here.
+    slower = [replace(row, kind="floor") for row in rows({"none": [7, 8, 9, 100], "lie:to=far": [7, 8, 9]}, "slower")]
+    found, floor = worst_cases([*attacked, *slower])
+    assert found.over_slower is not None
+    assert found.over_slower.value == pytest.approx((9 - 7 + 13 - 8 + 12 - 9) / 3)
+    assert (found.over_slower.low, found.over_slower.high) == (2, 5)
+    assert floor.over_slower is None
+    lines = worst_text([*attacked, *slower]).splitlines()
+    start = lines[1].index("over always-slower [95 %]")
+    assert [line[start:].split("  ")[0] for line in lines[3:5]] == ["3.3 [2.0, 5.0]", "–"]
+    # An agent that is only called so is not that driver; without the driver there is nothing to say.
+    named = [replace(row, agent="slower", kind="learned") for row in attacked]
+    assert {case.over_slower for case in worst_cases([*attacked, *named])} == {None}
 
 
 def test_a_sweep_is_a_table_and_a_plot():

@@ -66,7 +66,7 @@ def full(hostile: str = "plain") -> ReportData:
         rows=[
             *rows("slower", kind="floor"),
             *rows(hostile, kind="teacher", seeds=1),
-            *rows("RAPID", training_seed=0, has_network=True),
+            *rows("RAPID", training_seed=0, has_network=True, origin="rapid"),
             *rows("RAPID", "pgd", training_seed=0, has_network=True, gradient_attack=True),
             *rows("RAPID", hostile, training_seed=0, has_network=True),
         ],

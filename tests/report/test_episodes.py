@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from samples import SCENARIO, recording
 
+from rapid.agents.open import open_agent
 from rapid.agents.saved import QAgent
 from rapid.attacks.spec import parse_attack
 from rapid.config import NetworkConfig
@@ -103,4 +104,15 @@ def test_a_run_keeps_the_first_crashes_of_learned_agents_as_they_were(agent: QAg
     assert len(kept[0].action_T) == measured.length_E[first]
     assert kept[0].reward_T.sum() == pytest.approx(measured.return_E[first])
     assert kept[0].attack == "uniform"
-    assert crashes_of(preset(), agent, [(spec, replace(measured, kind="floor"))]) == []
+    assert crashes_of(preset(), agent, [(spec, replace(measured, kind="planner"))]) == []
+
+
+def test_of_a_scripted_driver_a_crash_is_kept_and_of_those_alike_one() -> None:
+    driver = open_agent("faster", SCENARIO)
+    seeds, attacks = range(900_000, 900_004), [parse_attack(text) for text in ("none", "lie:to=far", "uniform")]
+    driven = [(attack, run_episodes(driver, SCENARIO, seeds, attack)) for attack in attacks]
+    kept = crashes_of(preset(), driver, driven)
+    assert [(recording.agent, recording.attack) for recording in kept] == [("faster", "none")]
+    ruled = open_agent("rule", SCENARIO)
+    under = [(attack, run_episodes(ruled, SCENARIO, range(900_000, 900_030), attack)) for attack in attacks[1:]]
+    assert [recording.attack for recording in crashes_of(preset(), ruled, under)] == ["lie", "uniform"]

@@ -279,6 +279,17 @@ def test_the_gallery_plays_a_crash(opened: Open) -> None:
     assert 3 <= clock(page) < 6
 
 
+def test_the_table_of_crashes_plays_them(opened: Open) -> None:
+    driven = [*rows("RAPID"), *rows("RAPID", "pgd")]
+    page = opened(replace(run(ride(3), crashed()), rows=driven)).page
+    link = page.locator("#crashes").get_by_role("link", name="watch")
+    for _ in range(2):
+        link.click()
+        assert page.get_by_label("episode", exact=True).input_value() == "1"
+        until(page, "document.querySelector('.score').textContent.startsWith('crashed after 6 s')", 20)
+        page.get_by_label("episode", exact=True).select_option("0")
+
+
 def test_two_episodes_of_one_spawn_stand_side_by_side_on_one_clock(opened: Open) -> None:
     page = opened(run(ride(3), ride(5, "other"))).page
     assert page.get_by_label("beside it").input_value() == "1"

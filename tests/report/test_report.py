@@ -72,10 +72,21 @@ def test_the_worst_case_has_a_table_and_over_sizes_a_plot() -> None:
     content = page(ReportData(title="t", rows=pair, trained=False))
     assert 'id="worst"' in content
     assert "most often the worst" in content
+    with_floor = page(ReportData(title="t", rows=[*pair, *rows("slower", kind="floor")]))
+    assert "over always-slower [95 %]" in with_floor
+    assert "95 % interval 0.0 to 0.0; 8 spawns" in with_floor
     # What was not trained has no curves to miss.
     assert "No training was recorded" not in content
     assert plot(ReportData(title="t", rows=pair)) == []
     assert 'id="worst"' not in page(full())  # two attacks that are not of the same size
+    assert "within each threat" not in content
+    four = [("RAPID", "none"), *((f"<b>{n}", f"{kind}:radius=0.1{more}")
+            for n in range(2) for kind in ("pgd", "world") for more in ("", ",ego=trusted"))]  # fmt: skip
+    threats = page(ReportData(title="t", rows=[row for agent, attack in four for row in rows(agent, attack)]))
+    Reader(threats)
+    assert f"{SCENARIO}, within each threat" in threats
+    assert ">presence masked, ego row trusted</button>" in threats
+    assert "<b>0" not in threats
     kinds = ("pgd", "directed")
     swept = [
         *rows("RAPID"),
@@ -84,6 +95,33 @@ def test_the_worst_case_has_a_table_and_over_sizes_a_plot() -> None:
     charts = plot(ReportData(title="t", rows=swept))
     assert [x for x, _ in charts[0]["series"][0]["points"]] == [0, 2, 4, 10]
     assert charts[1]["series"][0]["points"][1][1] == pytest.approx(1 / 8)
+
+
+def test_crashes_are_counted_by_attack_and_agent_and_lead_to_what_was_kept() -> None:
+    kept = [replace(recording(), agent="<i>a", attack="pgd", seed=seed) for seed in (1, 2)]
+    driven = [
+        *rows("<i>a", seeds=4),
+        *(replace(row, crashed=row.seed < 3, length=row.seed + 5, hit=("ahead", "beside", "ahead", "")[row.seed])
+          for row in rows("<i>a", "pgd", seeds=4)),
+        *(replace(row, crashed=False) for row in rows("slower", kind="floor", seeds=4)),
+    ]  # fmt: skip
+    content = page(ReportData(title="t", rows=driven, recordings=[kept[0], recording(), kept[1]]))
+    Reader(content)
+    found = content[content.index('id="crashes"') : content.index('id="watch"')]
+    cells = re.findall(r"<td.*?</td>", found)
+    words = [re.sub(r"<[^>]*>", " ", cell).split() for cell in cells]
+    assert [" ".join(each) for each in words] == [
+        "1 of 4 at 30 s", "0 of 4",
+        "3 of 4 at 6 s ahead: 2 of 3 watch", "–",
+    ]  # fmt: skip
+    # The episode without attack comes first on the page.
+    assert re.findall(r'href="([^"]*)"', found) == ["#moment=1,,0"]
+    assert "<i>a" not in found
+    # Rows of earlier versions do not say what was hit, so that only what was kept tells.
+    old = [replace(row, hit="") for row in driven]
+    assert "ahead: 2 of 2 known" in page(ReportData(title="t", rows=old, recordings=kept))
+    calm = [replace(row, crashed=False) for row in driven]
+    assert 'id="crashes"' not in page(ReportData(title="t", rows=calm))
 
 
 def test_text_of_others_stays_text() -> None:
@@ -103,7 +141,8 @@ def test_page_asks_the_network_for_nothing() -> None:
     reader = Reader(content)
     for _, attributes in reader.tags:
         assert "src" not in attributes
-        assert attributes.get("href", "data:,") == "data:,"
+        # Links lead to moments within the page.
+        assert re.fullmatch(r"data:,|#moment=\d+,,\d+", attributes.get("href") or "data:,")
     assert "@import" not in content
     assert "url(" not in content
     links = set(re.findall(r"https?://[^\s\"'<\\]+", content))
@@ -146,15 +185,26 @@ def test_unwritable_place(tmp_path: Path) -> None:
 
 
 def test_verdict_needs_five_trainings() -> None:
-    one = ReportData(title="x", rows=rows("RAPID", training_seed=0))
+    one = ReportData(title="x", rows=rows("mine", training_seed=0, origin="rapid"))
     assert "insufficient" in page(one)
-    many = [row for seed in range(5) for row in rows("RAPID", training_seed=seed)]
+    many = [row for seed in range(5) for row in rows("RAPID", training_seed=seed, origin="rapid")]
     assert "our interval lies" in page(ReportData(title="x", rows=many))
 
 
 def test_paper_is_not_beside_another_reward() -> None:
-    other = [replace(row, scenario=f"{SCENARIO}:progress") for row in rows("RAPID", training_seed=0)]
+    other = [replace(row, scenario=f"{SCENARIO}:progress") for row in rows("RAPID", origin="rapid")]
     assert "20.42" not in page(ReportData(title="x", rows=other))
+
+
+def test_the_paper_is_beside_what_was_trained_here_whatever_it_is_called() -> None:
+    def shown(**changes: Any) -> bool:
+        return "20.42" in page(ReportData(title="x", rows=rows(**changes)))
+
+    assert shown(agent="a name of my own", origin="rapid")
+    assert not shown(agent="RAPID", origin="other")
+    # Rows of earlier versions have names alone; a model of other origin has no network that is known here.
+    assert shown(agent="RAPID", has_network=True)
+    assert not shown(agent="RAPID")
 
 
 def test_uniform_policy_is_marked_on_the_robust_curve_only() -> None:

@@ -60,6 +60,22 @@ class EpisodeRow:
     """Whether the agent has a network that a gradient attack can use."""
     gradient_attack: bool = False
     """Whether the attack needs the agent's gradient."""
+    hit: str = ""
+    """Where the car was that the ego touched: `ahead`, `beside` or `behind`; empty without a crash, and in rows of
+    earlier versions."""
+    origin: str = ""
+    """What the agent is, whatever it is called (:func:`rapid.agents.origin.origin_of`); empty in rows of earlier
+    versions."""
+
+    @property
+    def what(self) -> str:
+        """`origin`, or what rows of earlier versions let tell: by their names, which a run itself gave its agents."""
+        if self.origin:
+            return self.origin
+        if self.kind in ("floor", "planner"):
+            return self.agent
+        # A model of other origin has no network that this package knows.
+        return _NAMED.get(self.agent, "") if self.kind == "learned" and self.has_network else ""
 
     @property
     def progress_return(self) -> float:
@@ -71,6 +87,13 @@ class EpisodeRow:
         return self.length * self.mean_speed / PROGRESS_SPEED + PROGRESS_CRASH * self.crashed
 
 
+_NAMED = {
+    "RAPID": "rapid",
+    "distilled": "distilled",
+    "offline DQN": "offline-dqn",
+    "online DQN": "online-dqn",
+}
+"""What `rapid run` calls the agents that it trains, and by which method."""
 _SHARES = tuple(f"share_{action.lower()}" for action in ACTIONS)
 
 SCHEMA = pa.schema(
@@ -93,9 +116,13 @@ SCHEMA = pa.schema(
         ("has_network", pa.bool_()),
         ("gradient_attack", pa.bool_()),
         ("commit", pa.string()),
+        ("hit", pa.string()),
+        ("origin", pa.string()),
     ]
 )
 """Columns of the Parquet file; a share of actions is one column each."""
+_LATER = ("hit", "origin")
+"""Columns of text that files of earlier versions lack; there they are empty."""
 
 
 def _nullable(value: Any) -> Any:
@@ -130,6 +157,9 @@ def rows_of_table(table: pa.Table, path: str | os.PathLike[str]) -> list[Episode
     Raises:
         RapidError: it lacks a column.
     """
+    for name in _LATER:
+        if name not in table.column_names:
+            table = table.append_column(name, pa.array([""] * len(table), pa.string()))
     try:
         table = table.select(SCHEMA.names).cast(SCHEMA)
     except (KeyError, ValueError, pa.ArrowException) as error:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import rapid
 from rapid.agents.open import check_road, driver_for, kind_of
+from rapid.agents.origin import origin_of
 from rapid.attacks.attack import Attack, network_of, offers
 from rapid.attacks.spec import AttackSpec, parse_attack
 from rapid.errors import RapidError
@@ -53,6 +54,10 @@ class Episodes:
     kind: Kind = "learned"
     has_network: bool = False
     gradient_attack: bool = False
+    hit_E: tuple[str, ...] = ()
+    """What was hit in each episode that crashed, as in `EpisodeRow`; nothing at all is nothing known."""
+    origin: str = ""
+    """What the agent is, whatever it is called."""
     recordings: list[Recording] = field(default_factory=list[Recording])
 
     def __len__(self) -> int:
@@ -81,6 +86,8 @@ class Episodes:
                 kind=self.kind,
                 has_network=self.has_network,
                 gradient_attack=self.gradient_attack,
+                hit=self.hit_E[i] if self.hit_E else "",
+                origin=self.origin,
             )
             for i in range(len(self))
         ]
@@ -164,6 +171,8 @@ def run_episodes(
         kind=kind_of(agent),
         has_network=network_of(agent) is not None,
         gradient_attack=resolved is not None and resolved.needs_gradient,
+        hit_E=tuple(hit for part in parts for hit in part.hit_B),
+        origin=origin_of(agent),
     )
     for part in parts:
         episodes.recordings.extend(part.recordings(_name(agent), scenario, attack_name))

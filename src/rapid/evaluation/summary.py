@@ -73,6 +73,8 @@ class SummaryRow:
     label: str
     """The agent's name as shown."""
     kind: Kind
+    origin: str
+    """What it is, whatever it is called, as :attr:`EpisodeRow.what`."""
     metrics: dict[str, Estimate]
     """Without attack, by the name in :data:`METRICS`, and `iqm`, the interquartile mean of the return."""
     shares: tuple[float, ...]
@@ -107,6 +109,7 @@ def summarize(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> list[Su
             agent=agent,
             label=label_of(agent),
             kind=next(row.kind for of in by_attack.values() for row in of),
+            origin=next(row.what for of in by_attack.values() for row in of),
             metrics=_metrics(by_attack.get(CLEAN, []), resamples),
             shares=_shares(by_attack.get(CLEAN, [])),
             attacks={name: _cell(by_attack, name, needs, resamples) for name, needs in gradient.items()},
@@ -147,7 +150,7 @@ def _cell(by_attack: dict[str, list[EpisodeRow]], name: str, needs_gradient: boo
     without = needs_gradient and not any(row.has_network for row in others)
     without |= name.partition(":")[0] in NEED_VALUES and any(row.kind in ("floor", "teacher") for row in others)
     # All other planners read the worlds, so there is no observation of theirs to attack.
-    blind = any(row.kind == "planner" and row.agent != "planner-observation" for row in others)
+    blind = any(row.kind == "planner" and row.what != "planner-observation" for row in others)
     return AttackCell(None, None, NOT_APPLICABLE if without or blind else NOT_RUN)
 
 
@@ -210,25 +213,36 @@ def summary_text(rows: Sequence[EpisodeRow], resamples: int = RESAMPLES) -> str:
     return "\n\n".join(blocks)
 
 
-LEAD = "RAPID"
-"""The agent that a run is about."""
 _UNMOVED = ("slower", "idle", "faster", "blind")
 """Floors that do not look: they drive under every attack as without one."""
 
 
-def ahead_of(rows: Sequence[EpisodeRow], lead: str = LEAD, resamples: int = RESAMPLES) -> list[str]:
+def does_not_look(row: EpisodeRow) -> bool:
+    """Whether the agent drives the same whatever it is shown."""
+    return row.kind == "floor" and row.what.partition(":")[0] in _UNMOVED
+
+
+def lead_of(rows: Sequence[EpisodeRow]) -> str:
+    """Return the name of the one agent that RAPID adapted; empty if there is none, or several."""
+    found = {row.agent for row in rows if row.kind == "learned" and row.what.startswith("rapid")}
+    return next(iter(found)) if len(found) == 1 else ""
+
+
+def ahead_of(rows: Sequence[EpisodeRow], lead: str = "", resamples: int = RESAMPLES) -> list[str]:
     """Return a sentence for each scenario and attack under which `lead` drove: which floors and baselines are ahead.
 
-    Ahead is who has the higher mean return on the spawns that both drove; whether the 95 % interval of that difference
-    holds zero is said too. Teacher and planners are no baselines: they may take seconds for a decision.
+    Without a lead it is the one agent that RAPID adapted, if there is one. Ahead is who has the higher mean return on
+    the spawns that both drove; whether the 95 % interval of that difference holds zero is said too. Teacher and
+    planners are no baselines: they may take seconds for a decision.
     """
+    lead = lead or lead_of(rows)
     groups: dict[tuple[str, str], dict[str, list[EpisodeRow]]] = {}
     for row in rows:
         if row.kind in ("floor", "learned"):
             groups.setdefault((row.scenario, row.attack), {}).setdefault(row.agent, []).append(row)
     lines: list[str] = []
     for (scenario, attack), agents in groups.items():
-        clean = {name: of for name, of in groups.get((scenario, CLEAN), {}).items() if name in _UNMOVED}
+        clean = {name: of for name, of in groups.get((scenario, CLEAN), {}).items() if does_not_look(of[0])}
         agents = clean | agents
         others = [(name, of) for name, of in agents.items() if name != lead]
         if lead not in agents or not others:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rapid.agents.open import Driver
 from rapid.attacks.attack import Attack, Field, Moment, Shown, network_of, values_of
 from rapid.errors import RapidError
+from rapid.evaluation.crashes import hit_of
 from rapid.evaluation.metrics import time_to_collision
 from rapid.evaluation.recording import Recording
 from rapid.road import LANE_WIDTH
@@ -63,6 +64,7 @@ class Worlds:
         self.return_B, self.speed_B, self.distance_B = (np.zeros(count) for _ in range(3))
         self.length_B, self.lane_changes_B = (np.zeros(count, np.int64) for _ in range(2))
         self.crashed_B = np.zeros(count, np.bool_)
+        self.hit_B = [""] * count
         self.ttc_B = np.full(count, np.inf)
         self.counts_BA = np.zeros((count, NUM_ACTIONS), np.int64)
         self.decision_seconds = 0.0
@@ -99,6 +101,7 @@ class Worlds:
                 said = driver.commentary(seen_BVF, worlds)
                 for i, world in enumerate(worlds):
                     self._steps[world].append(_Step(obs_BVF[world].copy(), int(chosen[i]), *said[i], seen_BVF[world]))
+            before_BVF = obs_BVF
             # Copied: an environment may write its next observation into the same memory.
             obs_BVF, reward_B, terminated_B, truncated_B, info = env.step(action_B)
             obs_BVF = np.array(obs_BVF, np.float32)
@@ -106,6 +109,8 @@ class Worlds:
             self.length_B[worlds] += 1
             self.counts_BA[worlds, chosen] += 1
             self.crashed_B[worlds] = np.asarray(info["crashed"], np.bool_)[worlds]
+            for world in worlds[self.crashed_B[worlds]]:
+                self.hit_B[world] = hit_of(before_BVF[world], obs_BVF[world])
             self.speed_B[worlds] += np.asarray(info["speed"], np.float64)[worlds]
             self.distance_B[worlds] = obs_BVF[worlds, 0, 1] - start_B[worlds]
             new_lane_B = _lane(obs_BVF, lanes)

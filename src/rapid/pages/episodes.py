@@ -78,7 +78,11 @@ def rounded(values: Any, digits: int = 4) -> Any:
     return plain(np.round(np.asarray(values, np.float64), digits))
 
 
+def in_order(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the episodes that there is something of to see: those without an attack first, in the order given."""
+    return sorted((each for each in recordings if len(each.action_T)), key=lambda each: each.attack != "none")
+
+
 def side_by_side(recordings: Sequence[Recording]) -> list[dict[str, Any]]:
-    """Return recorded episodes for the player: those without an attack first, in the order given."""
-    drawn = [recording for recording in recordings if len(recording.action_T)]
-    return [moving_picture(recording) for recording in sorted(drawn, key=lambda of: of.attack != "none")]
+    """Return recorded episodes for the player, ordered by :func:`in_order`."""
+    return [moving_picture(recording) for recording in in_order(recordings)]

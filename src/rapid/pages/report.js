@@ -53,22 +53,24 @@ function recordedPlayer(place) {
     const moment = readMoment();
     if (moment) open(moment);
   });
-  return { root, open, player };
+  // Play the last seconds of an episode.
+  const playEnd = (index) => {
+    open({ first: index, second: null, time: Math.max(lengthOf(data.episodes[index]) - 4, 0) });
+    root.scrollIntoView({ block: "nearest" });
+    root.focus({ preventScroll: true });
+    player.setRunning(true);
+  };
+  return { playEnd, player };
 }
 
 // The gallery: each crash as a small picture of its last moment; a click plays its last seconds above.
-function crashGallery(place, { root, open, player }) {
+function crashGallery(place, { playEnd, player }) {
   const list = element("ul", { class: "gallery" });
   data.episodes.forEach((episode, i) => {
     if (!episode.crashed) return;
     const canvas = element("canvas", { "aria-hidden": "true" });
     const words = element("span", {}, element("b", {}, episode.agent), ` ${episode.attack === "none" ? "not attacked" : `under ${episode.attack}`}, spawn ${episode.spawn}, after ${lengthOf(episode)} s`);
-    const card = button("", { class: "crash-card" }, () => {
-      open({ first: i, second: null, time: Math.max(lengthOf(episode) - 4, 0) });
-      root.scrollIntoView({ block: "nearest" });
-      root.focus({ preventScroll: true });
-      player.setRunning(true);
-    });
+    const card = button("", { class: "crash-card" }, () => playEnd(i));
     card.append(canvas, words);
     list.append(element("li", {}, card));
     // A picture that moves while the pointer rests on it: the last three seconds, again and again.
@@ -95,4 +97,10 @@ const watch = document.getElementById("watch-canvas");
 if (watch) {
   const recorded = recordedPlayer(watch);
   crashGallery(watch, recorded);
+  for (const cell of document.querySelectorAll("a[data-crash]")) {
+    cell.addEventListener("click", (event) => {
+      event.preventDefault();
+      recorded.playEnd(Number(cell.dataset.crash));
+    });
+  }
 }

@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rapid.agents.open import check_road
+from rapid.agents.origin import at
 from rapid.agents.q_agent import QAgent
 from rapid.agents.saved import load_agent, save_agent
 from rapid.baselines import OnlineBaseline
@@ -125,7 +127,18 @@ def adapt_agent(config: Config, agent: Path, data: Path | None, out: Path, name:
                 origin=origin,
             )
     metadata = {"name": name, "phase": "adapt", "from": str(agent), "scenario": scenario, "seed": config.seed}
+    if (weight := _robust_weight(distilled.metadata)) is not None:
+        metadata["robust_weight"] = weight
     # What was used, which need not be what was asked for.
     used = replace(config, scenario=scenario, network=network.config, adapt=replace(settings, scenario=scenario))
     save_agent(out / "agent", network, metadata | {"config": parts_of(used, "network", "adapt")})
     return QAgent(network, name)
+
+
+def _robust_weight(metadata: dict[str, Any]) -> Any:
+    """Return the weight of J_robust with which an agent was distilled, however often adapted since; None if unknown.
+
+    The settings of an adapted agent no longer tell it, and it decides which of the paper's agents this is.
+    """
+    own = at(metadata, "config", "distill", "loss", "robust_weight")
+    return metadata.get("robust_weight") if own is None else own

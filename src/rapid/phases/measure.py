@@ -8,9 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from rapid.agents.open import PLANNERS, check_road, open_agent
+from rapid.agents.origin import origin_of
 from rapid.agents.q_agent import QAgent
 from rapid.agents.specs import digest
 from rapid.attacks import get_attack
@@ -25,7 +27,7 @@ from rapid.errors import DamagedError, RapidError
 from rapid.evaluation.metrics import EpisodeRow, load_rows, save_rows
 from rapid.evaluation.recording import Recording, explained_by, load_recordings, save_recordings
 from rapid.evaluation.rollouts import Episodes, is_applicable, run_episodes
-from rapid.evaluation.summary import summary_text
+from rapid.evaluation.summary import label_of, summary_text
 from rapid.evaluation.worst import worst_text
 from rapid.files import write_text
 from rapid.networks.q_network import QNetwork
@@ -52,7 +54,8 @@ PLANNER = "planner"
 RECORDED = 4
 """Episodes of the adapted agent, and of the teacher, that the report can play."""
 CRASHES = 2
-"""Crashes of an adapted agent under each attack that the report can play; of other learned agents, one."""
+"""Crashes of an adapted agent under each attack that the report can play; of other learned agents and of scripted
+drivers, one."""
 
 
 def compare(
@@ -79,7 +82,12 @@ def compare(
     opened = {spec: _open(config, spec, config.scenario) for spec in specs}
     names = [_checked_name(config, spec, opened[spec]) for spec in specs]
     # Two trainings of the same name would fall into one row of the table.
-    labels = {spec: f"{name} ({spec})" for spec, name in zip(specs, names, strict=True) if names.count(name) > 1}
+    # And what is only called as one of the drivers would be shown as that driver.
+    labels = {
+        spec: f"{name} ({spec})"
+        for spec, name in zip(specs, names, strict=True)
+        if names.count(name) > 1 or (label_of(name) != name and origin_of(opened[spec]) != name)
+    }
     settings = to_dict(without_place(config).evaluate)
     request = {
         "threads": config.threads,
@@ -297,12 +305,24 @@ def _is_adapted(agent: Any) -> bool:
 
 
 def crashes_of(config: Config, agent: Any, driven: Sequence[tuple[AttackSpec, Episodes]]) -> list[Recording]:
-    """Drive the first crashes of a learned agent again, under each attack, to keep what happened step by step."""
+    """Drive the first crashes of an agent again, under each attack, to keep what happened step by step.
+
+    Of learned agents and of scripted drivers, that is. A scripted driver that drove alike under another attack, because
+    it does not see what was done, is kept once.
+    """
     found: list[Recording] = []
+    alike: set[tuple[int, int, float]] = set()
     for attack, of in driven:
         known = {recording.seed for recording in of.recordings[:RECORDED]}
-        seeds = [int(seed) for seed in of.seed_E[of.crashed_E] if int(seed) not in known]
-        seeds = seeds[: CRASHES if _is_adapted(agent) else 1] if of.kind == "learned" else []
+        if of.kind not in ("learned", "floor"):
+            continue
+        crashed = [
+            (int(of.seed_E[i]), int(of.length_E[i]), float(of.return_E[i]))
+            for i in np.flatnonzero(of.crashed_E)
+            if int(of.seed_E[i]) not in known
+        ][: CRASHES if _is_adapted(agent) else 1]
+        seeds = [episode[0] for episode in crashed if of.kind == "learned" or episode not in alike]
+        alike |= set(crashed)
         if seeds:
             again = run_episodes(
                 agent,

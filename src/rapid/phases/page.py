@@ -13,6 +13,7 @@ from rapid.data.dataset import load_dataset, summary
 from rapid.data.fallbacks import fallback_notice
 from rapid.evaluation.metrics import load_rows
 from rapid.evaluation.recording import Recording
+from rapid.evaluation.summary import lead_of
 from rapid.files import read_json
 from rapid.phases.adapt import ONLINE, PPO
 from rapid.phases.data import data_folders
@@ -51,6 +52,8 @@ def write_run_report(config: Config, directory: Path) -> Path:
         notes.append(measured["note"])
     if config.scale in ("tiny", "quick"):
         notes.append(f"Scale {config.scale}: one training seed and few spawns. This shows that it works, not how well.")
+    rows = load_rows(directory / "evaluate" / "episodes.parquet")
+    lead = lead_of(rows) or "RAPID"
     data = ReportData(
         title=f"RAPID on {config.adapt.scenario or config.scenario}",
         settings=to_dict(config),
@@ -59,15 +62,15 @@ def write_run_report(config: Config, directory: Path) -> Path:
         command=shlex.join(["rapid", "run", *as_options(config), "--directory", f"{directory}-again"]),
         started=manifest["started"],
         timings={step: read_json(path)["seconds"] for step, path in steps.items() if path.exists()},
-        rows=load_rows(directory / "evaluate" / "episodes.parquet"),
-        main_agent="RAPID",
+        rows=rows,
+        main_agent=lead,
         distill={
             "distilled": load_metrics(directory / "distill" / "rapid"),
             "offline DQN": load_metrics(directory / "distill" / "offline-dqn"),
             "behaviour cloning": load_metrics(directory / "distill" / "cloning"),
         },
         adapt=_online_records(config, directory / "adapt"),
-        routing=_routing(config, directory, recordings),
+        routing=_routing(config, directory, recordings, lead),
         recordings=recordings,
         dataset={"driver": teacher_data.drivers, **summary(teacher_data)},
         notes=notes,
@@ -97,9 +100,9 @@ def _parts(config: Config, directory: Path) -> list[Path]:
     return [part for part, steps in parts.items() if steps]
 
 
-def _routing(config: Config, directory: Path, recordings: Sequence[Recording]) -> list[RoutingSnapshot]:
-    """The routing weights in one scene of RAPID's first recorded episode, before and after adaptation."""
-    recording = next((recording for recording in recordings if recording.agent == "RAPID"), None)
+def _routing(config: Config, directory: Path, recordings: Sequence[Recording], lead: str) -> list[RoutingSnapshot]:
+    """The routing weights in one scene of the adapted agent's first recorded episode, before and after adaptation."""
+    recording = next((recording for recording in recordings if recording.agent == lead), None)
     if recording is None or config.network.kind != "rapid":
         return []
     middle = len(recording.action_T) // 2

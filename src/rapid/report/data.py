@@ -17,15 +17,16 @@ Entries = Sequence[Mapping[str, Any]]
 
 PAPER_METHODS: dict[str, tuple[str, str]] = {
     "rapid": ("attack", "RAPID"),
-    "online dqn": ("attack", "Online DQN"),
-    "offline dqn": ("attack", "Offline DQN"),
-    "rapid without robust term": ("attack", "RAPID without robust term"),
+    "online-dqn": ("attack", "Online DQN"),
+    "offline-dqn": ("attack", "Offline DQN"),
+    "rapid-without-robust": ("attack", "RAPID without robust term"),
     "distilled": ("offline", "rapid"),
-    "distilled, no j_robust": ("offline", "rapid_without_robust"),
-    "offline ddqn": ("offline", "ddqn"),
+    "distilled-without-robust": ("offline", "rapid_without_robust"),
+    "offline-ddqn": ("offline", "ddqn"),
     "cql": ("offline", "cql"),
 }
-"""Where the paper has an agent's numbers, by the agent's name in small letters: a table, and its row or column."""
+"""Where the paper has the numbers of a method, as :func:`rapid.agents.origin.origin_of` tells it: a table, and its row
+or column. No name counts, and of what this package did not train there are none."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +84,12 @@ class ReportData:
         return next((row.agent for row in reversed(self.rows) if row.kind == "learned"), "")
 
 
-def paper_return(agent: str, scenario: Scenario, attack: str = "none") -> PaperResult | None:
-    """Return what the paper prints for this agent here, None where it has no such number.
+def paper_return(origin: str, scenario: Scenario, attack: str = "none") -> PaperResult | None:
+    """Return what the paper prints for an agent of this origin here, None where it has no such number.
 
     The paper's reward is the normalised one, and its offline table has no attacks.
     """
-    place = PAPER_METHODS.get(agent.lower())
+    place = PAPER_METHODS.get(origin)
     if place is None or scenario.reward != "normalized" or scenario.dynamics != "v0" or scenario.clock:
         return None
     table, key = place

@@ -78,7 +78,7 @@ def results_figure(rows: Sequence[SummaryRow], lead: str) -> Figure | None:
     for axes, (title, name, scale) in zip(grid, columns, strict=True):
         for y, row in enumerate(here):
             _whisker(axes, row.metrics[name], y, scale, _SOFT if row.is_reference else _ACCENT)
-            paper = paper_return(row.agent, scenario) if name == "episode_return" else None
+            paper = paper_return(row.origin, scenario) if name == "episode_return" else None
             if paper is not None:
                 axes.plot(
                     paper.mean, y, "D", color=_PAPER, markersize=4.5, fillstyle="none", label="as the paper prints"

@@ -6,9 +6,10 @@ from pathlib import Path
 from rapid.evaluation.summary import summarize, summary_text
 from rapid.files import write_text
 from rapid.pages import PLAYER, fill_page
-from rapid.pages.episodes import ACTION_WORDS, side_by_side
+from rapid.pages.episodes import ACTION_WORDS, in_order, side_by_side
 from rapid.pages.markup import Markup, join, tag
 from rapid.report import sections
+from rapid.report.crashes import crashes
 from rapid.report.curves import charts
 from rapid.report.data import ReportData
 from rapid.report.routing import routing
@@ -38,6 +39,7 @@ def page(run: ReportData) -> str:
         [
             sections.head(run),
             sections.results(run, summaries),
+            crashes(run.rows, in_order(run.recordings)),
             sections.drawn(
                 "watch",
                 "Watch it drive",

@@ -16,6 +16,7 @@ from rapid.report.tables import (
     caption,
     interval_words,
     results_table,
+    threats_table,
     worst_table,
 )
 from rapid.scenarios import get_scenario
@@ -114,7 +115,7 @@ def results(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
 
 
 def _verdict(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
-    ours = [row for row in summaries if row.agent == run.lead and paper_return(row.agent, get_scenario(row.scenario))]
+    ours = [row for row in summaries if row.agent == run.lead and paper_return(row.origin, get_scenario(row.scenario))]
     if not ours:
         return Markup("")
     trainings = min(row.metrics["episode_return"].training_seeds for row in ours)
@@ -127,7 +128,7 @@ def _verdict(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
         )
     words: list[str] = []
     for row in ours:
-        of, paper = row.metrics["episode_return"], paper_return(row.agent, get_scenario(row.scenario))
+        of, paper = row.metrics["episode_return"], paper_return(row.origin, get_scenario(row.scenario))
         assert paper is not None
         where = "above" if of.low > paper.mean else "below" if of.high < paper.mean else "around"
         words.append(f"{row.scenario}: our interval lies {where} the paper's mean of {paper.mean:.2f}.")
@@ -137,7 +138,7 @@ def _verdict(run: ReportData, summaries: Sequence[SummaryRow]) -> Markup:
 def _tiles(lead: SummaryRow, rows: Sequence[SummaryRow]) -> Markup:
     """Return the few numbers of the agent that the run is about."""
     of = lead.metrics
-    paper = paper_return(lead.agent, get_scenario(lead.scenario))
+    paper = paper_return(lead.origin, get_scenario(lead.scenario))
     tiles = [
         _tile("return", number(of["episode_return"].value), interval_words(of["episode_return"])),
         _tile(
@@ -150,8 +151,8 @@ def _tiles(lead: SummaryRow, rows: Sequence[SummaryRow]) -> Markup:
     ]
     if paper is not None:
         tiles.insert(1, _tile("the paper's return", f"{paper.mean:.2f}", f"± {paper.spread:.2f}, as printed"))
-    slower = next((row for row in rows if row.agent == "slower"), None)
-    planner = next((row for row in rows if row.agent == "planner"), None)
+    slower = next((row for row in rows if row.origin == "slower"), None)
+    planner = next((row for row in rows if row.origin == "planner"), None)
     if slower is not None and planner is not None:
         floor, top = slower.metrics["episode_return"].value, planner.metrics["episode_return"].value
         ours = of["episode_return"].value
@@ -206,6 +207,9 @@ def worst(run: ReportData) -> Markup:
     if not cases:
         return Markup("")
     parts: list[Markup] = []
+    for scenario in dict.fromkeys(case.scenario for case in cases):
+        if table := threats_table([case for case in cases if case.scenario == scenario], run.lead):
+            parts += [tag("h3", f"{scenario}, within each threat"), table]
     for scenario, threat in dict.fromkeys((case.scenario, case.threat) for case in cases):
         here = [case for case in cases if (case.scenario, case.threat) == (scenario, threat)]
         parts += [tag("h3", f"{scenario}, within {threat.words(get_scenario(scenario).lanes)}")]

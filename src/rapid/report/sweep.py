@@ -9,19 +9,17 @@ from matplotlib.figure import Figure
 from rapid.evaluation.metrics import EpisodeRow, column
 from rapid.evaluation.statistics import Estimate, estimate
 from rapid.evaluation.summary import aligned, label_of, with_interval
-from rapid.evaluation.worst import Worst, worst_cases
+from rapid.evaluation.worst import ENOUGH, Worst, brief, worst_cases
 
-ENOUGH = 3
-"""Sizes from which on there is something to draw."""
 _LINES = ("#1f6f8b", "#d0672a", "#6b57b8", "#3c8f4e", "#b33a67", "#8b7a2b", "#8a939b", "#4a525a")
 
 
 def swept(rows: Sequence[EpisodeRow]) -> list[Worst]:
     """Return the worst cases of the first scenario over sizes alike in all else, if there are enough sizes."""
     cases = [case for case in worst_cases(rows) if case.threat.radius > 0 and case.scenario == rows[0].scenario]
-    groups: dict[tuple[str, str], list[Worst]] = {}
+    groups: dict[tuple[str, ...], list[Worst]] = {}
     for case in cases:
-        groups.setdefault((case.threat.presence, case.threat.ego), []).append(case)
+        groups.setdefault(case.threat[3:], []).append(case)
     largest = max(groups.values(), key=lambda group: len({case.threat.radius for case in group}), default=[])
     return largest if len({case.threat.radius for case in largest}) >= ENOUGH else []
 
@@ -34,7 +32,7 @@ def sweep_text(rows: Sequence[EpisodeRow]) -> str:
     agents = list(dict.fromkeys(case.agent for case in cases))
     lines = [["worst case within", "clean", *(case_words(radius) for radius in _radii(cases))]]
     for agent in agents:
-        cells = [_cell(case_of(cases, agent, radius)) for radius in _radii(cases)]
+        cells = [brief(case_of(cases, agent, radius)) for radius in _radii(cases)]
         lines.append([label_of(agent), with_interval(_clean(rows, agent, "episode_return")), *cells])
     return aligned(lines)
 
@@ -117,10 +115,6 @@ def case_words(radius: float) -> str:
 
 def _radii(cases: Sequence[Worst]) -> list[float]:
     return sorted({case.threat.radius for case in cases})
-
-
-def _cell(case: Worst | None) -> str:
-    return "–" if case is None else f"{with_interval(case.episode_return)}, crashed {case.crashed.value:.0%}"
 
 
 def _clean(rows: Sequence[EpisodeRow], agent: str, name: str) -> Estimate:

@@ -17,7 +17,7 @@ from rapid.evaluation.summary import (
     number,
     units,
 )
-from rapid.evaluation.worst import Worst
+from rapid.evaluation.worst import OVER_SLOWER, Worst, threats_of
 from rapid.experiments.paper import PaperResult
 from rapid.pages.episodes import ACTION_WORDS
 from rapid.pages.markup import Markup, tag, text
@@ -31,7 +31,7 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
     """Return the table of one scenario, without attack."""
     scenario = get_scenario(rows[0].scenario)
     span = _span([row.metrics["episode_return"] for row in rows])
-    has_paper = any(paper_return(row.agent, scenario) for row in rows)
+    has_paper = any(paper_return(row.origin, scenario) for row in rows)
     has_other = scenario.reward != "progress"
     heads = [
         ("agent", "", "text"),
@@ -50,7 +50,7 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
     body: list[Markup] = []
     for row in rows:
         of = row.metrics
-        paper = paper_return(row.agent, scenario)
+        paper = paper_return(row.origin, scenario)
         body.append(
             tag(
                 "tr",
@@ -69,7 +69,7 @@ def results_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
                 class_=_row_class(row, lead),
             )
         )
-    return _table(heads, body)
+    return table(heads, body)
 
 
 def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
@@ -88,11 +88,11 @@ def attack_table(rows: Sequence[SummaryRow], lead: str) -> Markup:
     for row in rows:
         clean = AttackCell(row.metrics["episode_return"], row.metrics["crashed"])
         cells = [
-            _attack_cell(cell, paper_return(row.agent, scenario, attack), top)
+            _attack_cell(cell, paper_return(row.origin, scenario, attack), top)
             for attack, cell in {"none": clean, **row.attacks}.items()
         ]
         body.append(tag("tr", _name(row, lead), *cells, class_=_row_class(row, lead)))
-    return _table(heads, body)
+    return table(heads, body)
 
 
 def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
@@ -100,6 +100,7 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
     heads = [
         ("agent", "", "text"),
         ("return", "mean over spawns of the least return under any of the attacks", "number"),
+        (OVER_SLOWER, "return less that of the driver that always brakes, on the same spawns", "number"),
         ("crashed", "share of these worst episodes that end in a crash", "number"),
         ("attacks", "how many attacks were made on it", "number"),
         ("most often the worst", "the attack under which the most spawns earned least", "text"),
@@ -108,8 +109,9 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
     body = [
         tag(
             "tr",
-            tag("th", label_of(case.agent), scope="row", class_="name", data_value=label_of(case.agent).lower()),
+            _agent(case.agent),
             _cell(case.episode_return, bar=span),
+            _none_cell() if case.over_slower is None else _cell(case.over_slower),
             _cell(case.crashed, 0, 100, " %"),
             tag("td", len(case.attacks), data_value=len(case.attacks)),
             tag("td", case.worst_attack, data_value=case.worst_attack),
@@ -117,7 +119,25 @@ def worst_table(cases: Sequence[Worst], lead: str) -> Markup:
         )
         for case in cases
     ]
-    return _table(heads, body)
+    return table(heads, body)
+
+
+def threats_table(cases: Sequence[Worst], lead: str) -> Markup:
+    """Return the worst cases of one scenario in one table, a column a threat; nothing where none is needed."""
+    threats = threats_of(cases)
+    if not threats:
+        return Markup("")
+    top = max(case.episode_return.value for case in cases)
+    heads = [("agent", "", "text"), *((words, "worst case within this threat", "number") for words in threats.values())]
+    body: list[Markup] = []
+    for agent in dict.fromkeys(case.agent for case in cases):
+        own = {case.threat: case for case in cases if case.agent == agent}
+        cells = [
+            _attack_cell(AttackCell(case.episode_return, case.crashed), None, top) if case else _none_cell()
+            for case in map(own.get, threats)
+        ]
+        body.append(tag("tr", _agent(agent), *cells, class_="lead" if agent == lead else None))
+    return table(heads, body)
 
 
 def attack_sentences(attacks: Sequence[str], scenario: Scenario) -> list[str]:
@@ -140,7 +160,8 @@ def action_legend() -> Markup:
     return tag("p", *parts, class_="legend")
 
 
-def _table(heads: Sequence[tuple[str, str, str]], body: Sequence[Markup]) -> Markup:
+def table(heads: Sequence[tuple[str, str, str]], body: Sequence[Markup]) -> Markup:
+    """Return a table that can be sorted, of heads (label, help, what to sort by) and rows."""
     cells: list[Markup] = []
     for label, help_text, sort in heads:
         inside = tag("button", label, type="button") if sort != "none" else text(label)
@@ -155,8 +176,8 @@ def _table(heads: Sequence[tuple[str, str, str]], body: Sequence[Markup]) -> Mar
             )
         )
     head = tag("thead", tag("tr", *cells))
-    table = tag("table", head, tag("tbody", *body), class_="sortable")
-    return tag("div", table, class_="scroll", tabindex="0", role="region", aria_label="table")
+    inner = tag("table", head, tag("tbody", *body), class_="sortable")
+    return tag("div", inner, class_="scroll", tabindex="0", role="region", aria_label="table")
 
 
 def _row_class(row: SummaryRow, lead: str) -> str:
@@ -169,6 +190,10 @@ def _name(row: SummaryRow, lead: str) -> Markup:
     if row.agent == lead:
         badge = [tag("span", "this run", class_="badge lead")]
     return tag("th", row.label, *badge, scope="row", class_="name", data_value=row.label.lower())
+
+
+def _agent(name: str) -> Markup:
+    return tag("th", label_of(name), scope="row", class_="name", data_value=label_of(name).lower())
 
 
 def interval_words(of: Estimate, digits: int = 1, scale: float = 1.0, suffix: str = "") -> str:
@@ -193,6 +218,11 @@ def _cell(
         inside.append(tag("small", f"{number(of.low, digits, scale)}–{number(of.high, digits, scale)}"))
     value = None if math.isnan(of.value) else of.value
     return tag("td", *inside, data_value=value, title=interval_words(of, digits, scale, suffix))
+
+
+def _none_cell() -> Markup:
+    """Return a cell of what there is no number for."""
+    return tag("td", tag("span", NOT_RUN, class_="value none"))
 
 
 def _plain_cell(of: Estimate, digits: int) -> Markup:
@@ -225,7 +255,7 @@ def _interval_bar(of: Estimate, span: tuple[float, float]) -> Markup:
 
 def _paper_cell(paper: PaperResult | None) -> Markup:
     if paper is None:
-        return tag("td", tag("span", NOT_RUN, class_="value none"))
+        return _none_cell()
     words = f"the paper prints {paper.mean:.2f} ± {paper.spread:.2f}"
     inside = (tag("span", f"{paper.mean:.2f}", class_="value"), tag("small", f"± {paper.spread:.2f}"))
     return tag("td", *inside, data_value=paper.mean, title=words, class_="paper")

@@ -49,14 +49,15 @@ class Scripted(Watchable):
             )
         self.name = name
         """How it is labelled; may be changed."""
-        self._driver = name
+        self.driver = name
+        """Which driver it is, whatever it is called."""
         self._lanes = lanes
         self._seed = stream_seed(seed, f"teacher/{name}")
         self.plan = (read_plan(plan) if plan else plan_for(scenario)) if kind == "blind" else None
 
     def describe(self) -> dict[str, Any]:
         """Return the driver's identity."""
-        return {"backend": "scripted", "model": self._driver} | ({"plan": list(self.plan)} if self.plan else {})
+        return {"backend": "scripted", "model": self.driver} | ({"plan": list(self.plan)} if self.plan else {})
 
     def decide(
         self,
@@ -69,7 +70,7 @@ class Scripted(Watchable):
         scenes = read_scenes(obs_BVF, self._lanes)
         if self.plan is not None:
             chosen = [_follow(self.plan, before) for before in previous]
-        elif self._driver == "immune":
+        elif self.driver == "immune":
             chosen = [_wait(bool((presence_V >= 0.5).any())) for presence_V in np.asarray(obs_BVF)[:, 1:, 0]]
         else:
             chosen = [self._choose(scene, keys_B, world) for world, scene in enumerate(scenes)]
@@ -82,14 +83,14 @@ class Scripted(Watchable):
     def _choose(
         self, scene: Scene, keys_B: NDArray[np.int64] | None, world: int
     ) -> tuple[int, str, tuple[float, ...] | None]:
-        if self._driver in _CONSTANTS:
-            return _CONSTANTS[self._driver], "", None
-        if self._driver in _RULES:
-            action, explanation = _RULES[self._driver](gather(scene))
+        if self.driver in _CONSTANTS:
+            return _CONSTANTS[self.driver], "", None
+        if self.driver in _RULES:
+            action, explanation = _RULES[self.driver](gather(scene))
             return action, explanation, None
-        choices = list(range(NUM_ACTIONS)) if self._driver == "random" else safe_actions(gather(scene))
+        choices = list(range(NUM_ACTIONS)) if self.driver == "random" else safe_actions(gather(scene))
         if keys_B is None:
-            raise RapidError(f"The driver '{self._driver}' draws at random: pass `keys_B`, one number per decision.")
+            raise RapidError(f"The driver '{self.driver}' draws at random: pass `keys_B`, one number per decision.")
         # Not a shared generator: each draw depends on its own key, however the worlds are batched.
         generator = np.random.default_rng((self._seed, int(keys_B[world]) & (2**64 - 1)))
         probabilities = tuple(float(action in choices) / len(choices) for action in range(NUM_ACTIONS))
