@@ -146,7 +146,7 @@ def reproduce(options: Reproduce, config: Config) -> int:
     if not options.ids or options.dry_run:
         print(listing(of))
         return 0
-    out = Path(options.out or f"runs/reproduce/{options.recipe}-{options.scale}")
+    out = Path(options.out or f"runs/reproduce/{'-'.join((*of.recipes, options.scale))}")
     failed: dict[str, str] = {}
     if options.page_only:
         page = write_page(of, out)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rapid.cli import main
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import readme, tables
@@ -19,6 +20,13 @@ from rapid.experiments.store import Store
 from rapid.experiments.tables import Entry, Facts, Table, entry
 
 RESULTS = Path(__file__).parents[2] / "results"
+
+
+def command(*words: str) -> object:
+    """Return how a command ends."""
+    with pytest.raises(SystemExit) as stop:
+        main(list(words))
+    return stop.value.code
 
 
 def rows(mean: float, seeds: int, spawns: int = 20) -> list[EpisodeRow]:
@@ -136,6 +144,48 @@ def test_a_page_of_nothing_says_what_is_missing(tmp_path: Path, monkeypatch: pyt
     assert "KinematicsObservation" in page
     assert (tmp_path / "page" / "tables" / "attack.tex").exists()
     assert (tmp_path / "page" / "figures" / "ratio.svg").exists()
+
+
+def test_without_a_recipe_each_exhibit_is_shown_in_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    of = open_reproduction(("teachers", "environment"), "", "tiny", tmp_path / "store")
+    assert [of.request(exhibit).recipe for exhibit in of.exhibits] == ["strong", "paper"]
+    assert of.recipes == ["paper", "strong"]
+    assert [line.split()[:2] for line in listing(of).splitlines()[3:5]] == [
+        ["teachers", "strong"],
+        ["environment", "paper"],
+    ]
+    page = write_page(of, tmp_path / "page").read_text()
+    assert "Recipes paper and strong, as the command under each says, scale tiny." in page
+    assert "rapid reproduce teachers --recipe strong --scale tiny" in page
+    assert "rapid reproduce environment --recipe paper --scale tiny" in page
+    alone = open_reproduction(("teachers",), "", "tiny", tmp_path / "store")
+    assert alone.recipes == ["strong"]
+    assert "Recipe strong, scale tiny." in write_page(alone, tmp_path / "alone").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "recipes", "place"),
+    [
+        (["teachers", "environment"], {"teachers": "strong", "environment": "paper"}, "paper-strong-tiny"),
+        (["environment"], {"environment": "paper"}, "paper-tiny"),
+        (["hyperparameters", "--recipe", "strong"], {"hyperparameters": "strong"}, "strong-tiny"),
+    ],
+)
+def test_the_command_takes_each_id_in_its_own_recipe(
+    words: list[str],
+    recipes: dict[str, str],
+    place: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.chdir(tmp_path)
+    assert command("reproduce", *words, "--scale", "tiny", "--dry-run") == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert {line[0]: line[1] for line in lines if line and line[0] in ALL} == recipes
+    assert command("reproduce", *words, "--scale", "tiny", "--page-only") == 0
+    assert [path.name for path in Path("runs/reproduce").iterdir()] == [place]
 
 
 def test_words_are_those_of_the_presets():

@@ -35,8 +35,15 @@ class Reproduction:
 
     exhibits: tuple[Exhibit, ...]
     recipe: str
+    """Empty: each exhibit's own first."""
     scale: str
     store: Store
+
+    @property
+    def recipes(self) -> list[str]:
+        """The recipes in which the exhibits are shown."""
+        shown = {self.request(exhibit).recipe for exhibit in self.exhibits}
+        return [recipe for recipe in RECIPES if recipe in shown]
 
     def request(self, exhibit: Exhibit) -> Request:
         """Return the version of an exhibit."""
@@ -54,12 +61,12 @@ class Reproduction:
 def open_reproduction(
     ids: Sequence[str], recipe: str, scale: str, store: Path, layers: Sequence[Path] = ()
 ) -> Reproduction:
-    """Return what is asked for; no id is every exhibit.
+    """Return what is asked for; no id is every exhibit, and no recipe each exhibit's own first.
 
     Raises:
         RapidError: an id, recipe or scale does not exist, an exhibit lacks the recipe, or the store cannot be used.
     """
-    for kind, value, choices in (("recipe", recipe, RECIPES), ("scale", scale, tuple(EFFORTS))):
+    for kind, value, choices in (("recipe", recipe or RECIPES[0], RECIPES), ("scale", scale, tuple(EFFORTS))):
         if value not in choices:
             raise RapidError(
                 f"Unknown {kind} '{value}'{did_you_mean(value, choices)} Choose one of {', '.join(choices)}."
@@ -69,13 +76,13 @@ def open_reproduction(
             raise RapidError(
                 f"There is no exhibit '{name}'{did_you_mean(name, ALL)} `rapid reproduce` lists them: {', '.join(ALL)}."
             )
-        if recipe not in ALL[name].recipes:
+        if recipe and recipe not in ALL[name].recipes:
             raise RapidError(
                 f"'{name}' has no recipe '{recipe}', only {', '.join(ALL[name].recipes)}. Give --recipe "
-                f"{ALL[name].recipes[0]}."
+                f"{ALL[name].recipes[0]}, or none: then each is shown in its own."
             )
     exhibits = tuple(ALL[name] for name in dict.fromkeys(ids)) or tuple(
-        exhibit for exhibit in ALL.values() if recipe in exhibit.recipes
+        exhibit for exhibit in ALL.values() if (recipe or "paper") in exhibit.recipes
     )
     usual = RESULTS / "cells"
     found = [*layers, *([usual] if usual.is_dir() and usual not in layers else [])]
@@ -168,7 +175,7 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
             tag("h1", "The paper, reproduced"),
             tag(
                 "p",
-                f"Recipe {of.recipe}, scale {of.scale}. Ours: mean with 95 % interval, interquartile mean (IQM) and "
+                f"{_recipes(of)}, scale {of.scale}. Ours: mean with 95 % interval, interquartile mean (IQM) and "
                 "crash share; the paper's number as printed. ≈ the paper's mean lies in our interval; ▲ our interval "
                 "lies above it; ▼ below it; fewer than five trainings are no verdict.",
             ),
@@ -188,6 +195,13 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
     )
     write_text(page, html)
     return page.resolve()
+
+
+def _recipes(of: Reproduction) -> str:
+    """Return the recipes of a page, as its first words."""
+    if len(of.recipes) == 1:
+        return f"Recipe {of.recipes[0]}"
+    return f"Recipes {' and '.join(of.recipes)}, as the command under each says"
 
 
 def _block(shown: Shown, out: Path) -> Markup:
