@@ -111,7 +111,7 @@ class Reproduce:
     """
 
     ids: Annotated[Positional[tuple[str, ...]], arg(metavar="ID ...")] = ()
-    """Such as attack, offline or ratio; `all` is every one."""
+    """Such as attack, offline or ratio; `all` is every one, with --recipe every one that has it."""
     recipe: Annotated[str, arg(metavar="{paper,strong}")] = ""
     """How things are trained; by default as the paper does, and by `strong` what only that has."""
     scale: Scale = Config.scale

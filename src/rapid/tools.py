@@ -136,13 +136,12 @@ def _fill_blocks(store: Path, check: bool) -> int:
 
 def reproduce(options: Reproduce, config: Config) -> int:
     from rapid.experiments.exhibits import ALL, cells_of
-    from rapid.experiments.reproduce import listing, open_reproduction, reproduce, text_of, write_page
+    from rapid.experiments.reproduce import EVERY, listing, open_reproduction, reproduce, text_of, write_page
 
-    ids = () if options.ids == ("all",) else options.ids
     layers = [Path(layer) for layer in options.layers]
     if options.readme or options.check:
         return _fill_blocks(Path(options.store), options.check)
-    of = open_reproduction(ids, options.recipe, options.scale, Path(options.store), layers)
+    of = open_reproduction(options.ids, options.recipe, options.scale, Path(options.store), layers)
     if not options.ids or options.dry_run:
         print(listing(of))
         return 0
@@ -159,7 +158,7 @@ def reproduce(options: Reproduce, config: Config) -> int:
             of.store.export(
                 cells_of(ALL[exhibit.id], of.request(exhibit).recipe, options.scale), Path(options.export), name
             )
-    if ids:
+    if EVERY not in options.ids:
         print(text_of(of))
     print(f"page: {page}")
     if failed:

@@ -188,6 +188,16 @@ def test_the_command_takes_each_id_in_its_own_recipe(
     assert [path.name for path in Path("runs/reproduce").iterdir()] == [place]
 
 
+@pytest.mark.parametrize("ids", [(), ("all",), ("attack", "all"), ("all", "robustness")])
+def test_every_id_is_listed_and_all_is_every_one_also_beside_others(ids: tuple[str, ...], tmp_path: Path):
+    of = open_reproduction(ids, "", "tiny", tmp_path / "store")
+    assert [exhibit.id for exhibit in of.exhibits] == list(ALL)
+    assert all(of.request(exhibit).recipe == exhibit.recipes[0] for exhibit in of.exhibits)
+    # A recipe that is named is what all of them are shown in.
+    paper = open_reproduction(ids[:1] if "all" in ids[:1] else (), "paper", "tiny", tmp_path / "store")
+    assert {exhibit.id for exhibit in paper.exhibits} == {name for name in ALL if "paper" in ALL[name].recipes}
+
+
 def test_words_are_those_of_the_presets():
     (facts,) = ALL["hyperparameters"].show(Request("paper", "full"), Store.__new__(Store), ALL["hyperparameters"])
     assert isinstance(facts, Facts)
@@ -199,6 +209,8 @@ def test_words_are_those_of_the_presets():
     [
         (("atack",), "paper", "tiny", "did you mean 'attack'"),
         (("floors",), "paper", "tiny", "only strong"),
+        (("all", "floors"), "paper", "tiny", "only strong"),
+        (("all", "atack"), "", "tiny", "did you mean 'attack'"),
         ((), "papper", "tiny", "did you mean 'paper'"),
         ((), "paper", "long", "tiny, quick, full"),
     ],

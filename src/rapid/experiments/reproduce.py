@@ -28,6 +28,9 @@ from rapid.runs import commit, versions
 RESULTS = Path("results")
 """Where committed results lie in a checkout; their folder ``cells`` is the store's read-only layer."""
 
+EVERY = "all"
+"""Among ids: every exhibit."""
+
 
 @dataclass(frozen=True)
 class Reproduction:
@@ -61,7 +64,9 @@ class Reproduction:
 def open_reproduction(
     ids: Sequence[str], recipe: str, scale: str, store: Path, layers: Sequence[Path] = ()
 ) -> Reproduction:
-    """Return what is asked for; no id is every exhibit, and no recipe each exhibit's own first.
+    """Return what is asked for; no id, or `all` among them, is every exhibit that has the recipe.
+
+    No recipe is each exhibit's own first.
 
     Raises:
         RapidError: an id, recipe or scale does not exist, an exhibit lacks the recipe, or the store cannot be used.
@@ -72,18 +77,22 @@ def open_reproduction(
                 f"Unknown {kind} '{value}'{did_you_mean(value, choices)} Choose one of {', '.join(choices)}."
             )
     for name in ids:
+        if name == EVERY:
+            continue
         if name not in ALL:
             raise RapidError(
-                f"There is no exhibit '{name}'{did_you_mean(name, ALL)} `rapid reproduce` lists them: {', '.join(ALL)}."
+                f"There is no exhibit '{name}'{did_you_mean(name, (EVERY, *ALL))} `rapid reproduce` lists them: "
+                f"{', '.join(ALL)}; `{EVERY}` is every one."
             )
         if recipe and recipe not in ALL[name].recipes:
             raise RapidError(
                 f"'{name}' has no recipe '{recipe}', only {', '.join(ALL[name].recipes)}. Give --recipe "
                 f"{ALL[name].recipes[0]}, or none: then each is shown in its own."
             )
-    exhibits = tuple(ALL[name] for name in dict.fromkeys(ids)) or tuple(
-        exhibit for exhibit in ALL.values() if (recipe or "paper") in exhibit.recipes
-    )
+    if not ids or EVERY in ids:
+        exhibits = tuple(exhibit for exhibit in ALL.values() if not recipe or recipe in exhibit.recipes)
+    else:
+        exhibits = tuple(ALL[name] for name in dict.fromkeys(ids))
     usual = RESULTS / "cells"
     found = [*layers, *([usual] if usual.is_dir() and usual not in layers else [])]
     for layer in layers:
