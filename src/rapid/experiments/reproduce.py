@@ -114,15 +114,18 @@ def without_layers(of: Reproduction) -> str:
 def listing(of: Reproduction) -> str:
     """Return every exhibit with what is done, predicted time and decisions of language models."""
     lines = [["id", "recipe", "done", "to do", "predicted", "LLM decisions", "what it is"]]
+    every: list[Cell] = []
     for exhibit in of.exhibits:
         request = of.request(exhibit)
-        due = plan(cells_of(exhibit, request.recipe, of.scale), of.store)
+        cells = cells_of(exhibit, request.recipe, of.scale)
+        every += cells
+        due = plan(cells, of.store)
         more = f" + {due.unknown} parts of unknown time" if due.unknown else ""
         time = f"{format_seconds(due.seconds)}{more}" if due.todo else "–"
         lines.append(
             [exhibit.id, request.recipe, str(due.done), str(len(due.todo)), time, str(due.decisions), exhibit.caption]
         )
-    whole = plan(of.cells(), of.store)
+    whole = plan(every, of.store)
     total = f"Together, shared parts once: {len(whole.todo)} to do, {format_seconds(whole.seconds)} for one process"
     asked = f"{whole.decisions} decisions of language models; scale {of.scale}."
     return f"{without_layers(of)}{aligned(lines)}\n\n{total}, as predicted, {asked}"
