@@ -262,6 +262,22 @@ def test_a_page_s_blocks_are_filled_from_the_rows_and_an_unknown_block_is_named(
         readme.filled(page.replace("teachers:strong", "teacher"), store, Path("page.md"))
 
 
+@pytest.mark.parametrize("option", ["--check", "--readme"])
+def test_where_no_block_is_marked_nothing_is_said_to_be_right(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    assert command("reproduce", option) == 2
+    assert f"no marked block (<!-- table: NAME -->) in README.md or docs/ below '{tmp_path}'" in capsys.readouterr().err
+    assert command("reproduce", "attack", "routing", option) == 2
+    assert "'attack routing' was given. Leave the ids out" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    page = "<!-- table: rates -->\n<!-- end -->\n"
+    Path("README.md").write_text(page)
+    assert command("reproduce", option) == (1 if option == "--check" else 0)
+    assert (Path("README.md").read_text() == page) == (option == "--check")
+
+
 def test_older_rows_stand_in_until_as_many_trainings_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     store = Store(tmp_path / "store", [], RESULTS)
     drives = method_drives(Request("strong", "full"), METHODS["rapid-robust"], "lane-3-density-2", ("pgd",))
