@@ -2,8 +2,10 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import socket
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -86,6 +88,32 @@ def test_engines_that_cannot_be_had(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(RapidError, match=r"-e '\.\[ray\]'.*; or use --engine local"):
         list(run_jobs(job, [1], engine="ray"))
+
+
+def test_a_cluster_that_does_not_answer_is_told_before_work_starts(monkeypatch):
+    # Without Ray, which may not be installed: only what is asked of it before it starts.
+    begun = False
+    monkeypatch.setattr(engines, "_need_ray", lambda: SimpleNamespace(is_initialized=lambda: begun))
+    with socket.socket() as closed, socket.socket() as head:
+        closed.bind(("127.0.0.1", 0))  # nobody listens
+        head.bind(("127.0.0.1", 0))
+        head.listen()
+        nobody, somebody = (f"127.0.0.1:{each.getsockname()[1]}" for each in (closed, head))
+        for address in (nobody, f"ray://{nobody}", "127.0.0.1:99999", "no.host.invalid:6379"):
+            monkeypatch.setenv("RAY_ADDRESS", address)
+            start = time.monotonic()
+            with pytest.raises(RapidError, match=rf"'{address}', and no Ray cluster answers.*--engine local"):
+                engines.check_engine("ray")
+            assert time.monotonic() - start < 30
+        with pytest.raises(RapidError, match="no Ray cluster answers"):
+            list(run_jobs(job, [1], engine="ray"))
+        engines.check_engine("local")
+        for address in (somebody, "auto", "local", ""):
+            monkeypatch.setenv("RAY_ADDRESS", address)
+            engines.check_engine("ray")
+        begun = True  # what runs already is used, wherever RAY_ADDRESS points
+        monkeypatch.setenv("RAY_ADDRESS", nobody)
+        engines.check_engine("ray")
 
 
 def test_another_version_is_refused():

@@ -20,6 +20,7 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 import rapid
 from rapid import termination
 from rapid.errors import RapidError, did_you_mean, how_to_install
+from rapid.ray_address import check_ray_address
 
 Engine = Literal["local", "ray"]
 """`local`: this machine. `ray`: the cluster that the environment variable RAY_ADDRESS names or that runs here, else a
@@ -116,15 +117,15 @@ def check_engine(engine: str) -> None:
     """Look whether an engine can be had.
 
     Raises:
-        RapidError: it does not exist, or is not installed.
+        RapidError: it does not exist, is not installed, or nobody answers where RAY_ADDRESS says.
     """
     if engine not in get_args(Engine):
         raise RapidError(
             f"Unknown engine '{engine}'{did_you_mean(engine, get_args(Engine))} "
             f"Choose one of {', '.join(get_args(Engine))}."
         )
-    if engine == "ray":
-        _need_ray()
+    if engine == "ray" and not _need_ray().is_initialized():
+        check_ray_address(os.environ.get("RAY_ADDRESS", ""))
 
 
 def _in_processes(

@@ -12,7 +12,7 @@ from rapid.config_io import apply_overrides, load_toml, validate
 from rapid.errors import RapidError
 from rapid.options import Adversary, Evaluate, Run, Source
 from rapid.presets import of_file, preset, without_presets
-from rapid.tool_options import Certify, Play
+from rapid.tool_options import Certify, Play, Reproduce
 from rapid.usage import check_options, short_help
 
 T = TypeVar("T")
@@ -108,6 +108,8 @@ def _with_options(base: Config, options: Any) -> Config:
         options = dataclasses.replace(options, scenario=own_scenario([options.agent]) or base.scenario)
     if isinstance(options, Play) and not options.scenario:
         options = dataclasses.replace(options, scenario=base.scenario)  # the page itself asks where its agents belong
+    if isinstance(options, Reproduce):
+        options = dataclasses.replace(options, recipe=options.recipe or base.recipe)  # without one: each id's own
     names = {item.name for item in dataclasses.fields(options)} & {item.name for item in dataclasses.fields(Config)}
     config = dataclasses.replace(base, **{name: getattr(options, name) for name in names})
     curve_spawns = getattr(options, "curve_spawns", None)

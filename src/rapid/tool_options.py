@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from rapid.bounds import AboveZero, Bounds, Positive, Seed, Side, SideOrNone, Workers
-from rapid.config import CollectConfig, Config, Recipe, Scale, TeacherConfig
+from rapid.config import CollectConfig, Config, Scale, TeacherConfig
 from rapid.options import Flat, Source
 from rapid.scenarios import PAPER_SCENARIOS
 
@@ -111,9 +111,9 @@ class Reproduce:
     """
 
     ids: Annotated[Positional[tuple[str, ...]], arg(metavar="ID ...")] = ()
-    """Such as attack, offline or ratio; `all` is every one."""
-    recipe: Recipe = "paper"
-    """How things are trained."""
+    """Such as attack, offline or ratio; `all` is every one, with --recipe every one that has it."""
+    recipe: Annotated[str, arg(metavar="{paper,strong}")] = ""
+    """How things are trained; by default as the paper does, and by `strong` what only that has."""
     scale: Scale = Config.scale
     """How much is run: tiny (minutes), quick, full (five trainings, 200 spawns)."""
     engine: Annotated[str, arg(metavar="{local,ray}")] = CollectConfig.engine
@@ -125,7 +125,7 @@ class Reproduce:
     layers: tuple[str, ...] = ()
     """Directories of small results that are only read; results/cells is one wherever it is there."""
     out: str = ""
-    """Directory of the page; by default runs/reproduce/RECIPE-SCALE."""
+    """Directory of the page; by default runs/reproduce/RECIPES-SCALE."""
     export: str = ""
     """Also write the small results to this directory, as a layer for other checkouts."""
     dry_run: bool = False

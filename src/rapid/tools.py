@@ -122,11 +122,23 @@ def report(options: Report, config: Config) -> int:
     return 0
 
 
-def _fill_blocks(store: Path, check: bool) -> int:
-    from rapid.experiments.readme import update
+def _fill_blocks(options: Reproduce) -> int:
+    from rapid.experiments.readme import pages, update
     from rapid.experiments.reproduce import open_reproduction
 
-    stale = update(Path(), open_reproduction((), Config.recipe, "full", store).store, check)
+    check, here = options.check, Path()
+    if options.ids:
+        raise RapidError(
+            f"--readme and --check are of every marked block in README.md and docs/, not of ids, and "
+            f"'{' '.join(options.ids)}' was given. Leave the ids out, or the option."
+        )
+    if not pages(here):
+        raise RapidError(
+            f"There is no marked block (<!-- table: NAME -->) in README.md or docs/ below '{here.resolve()}'. Expected "
+            "RAPID's checkout: start this there."
+        )
+    store = open_reproduction((), options.recipe, "full", Path(options.store)).store
+    stale = update(here, store, check)
     told = ", ".join(map(str, stale))
     if check and stale:
         print(f"Not what the rows say: {told}. Mend with: rapid reproduce --readme", file=sys.stderr)
@@ -137,17 +149,16 @@ def _fill_blocks(store: Path, check: bool) -> int:
 
 def reproduce(options: Reproduce, config: Config) -> int:
     from rapid.experiments.exhibits import ALL, cells_of
-    from rapid.experiments.reproduce import listing, open_reproduction, reproduce, text_of, write_page
+    from rapid.experiments.reproduce import EVERY, listing, open_reproduction, reproduce, text_of, write_page
 
-    ids = () if options.ids == ("all",) else options.ids
-    layers = [Path(layer) for layer in options.layers]
     if options.readme or options.check:
-        return _fill_blocks(Path(options.store), options.check)
-    of = open_reproduction(ids, options.recipe, options.scale, Path(options.store), layers)
+        return _fill_blocks(options)
+    layers = [Path(layer) for layer in options.layers]
+    of = open_reproduction(options.ids, options.recipe, options.scale, Path(options.store), layers)
     if not options.ids or options.dry_run:
         print(listing(of))
         return 0
-    out = Path(options.out or f"runs/reproduce/{options.recipe}-{options.scale}")
+    out = Path(options.out or f"runs/reproduce/{'-'.join((*of.recipes, options.scale))}")
     failed: dict[str, str] = {}
     if options.page_only:
         page = write_page(of, out)
@@ -160,7 +171,7 @@ def reproduce(options: Reproduce, config: Config) -> int:
             of.store.export(
                 cells_of(ALL[exhibit.id], of.request(exhibit).recipe, options.scale), Path(options.export), name
             )
-    if ids:
+    if EVERY not in options.ids:
         print(text_of(of))
     print(f"page: {page}")
     if failed:

@@ -54,7 +54,18 @@ def test_keys_do_not_move_by_accident():
 def test_an_epoch_that_is_raised_makes_anew(monkeypatch: pytest.MonkeyPatch):
     before = key(DRIVE)
     monkeypatch.setitem(cells.EPOCH, "distill", 2)
-    assert key(DRIVE) != before
+    assert key(replace(DRIVE, agent=replace(AGENT))) != before  # in another process: there no key was made before
+
+
+def test_a_key_is_made_once_a_cell_and_a_changed_cell_has_its_own(monkeypatch: pytest.MonkeyPatch):
+    made, describe = [], cells.describe
+    monkeypatch.setattr(cells, "describe", lambda cell: (made.append(cell), describe(cell))[1])
+    agent = replace(AGENT, data=replace(MIX))
+    drives = [Drive(agent, "lane-3-density-2", name, 200) for name in ("none", "pgd")]
+    assert [key(drive) for drive in drives] == [key(drive) for drive in drives]
+    assert sorted(map(cells.kind_of, made)) == ["distill", "drive", "drive", "mix"]
+    assert key(replace(drives[0], attack="pgd")) == key(drives[1])
+    assert drives[0] == replace(drives[0])
 
 
 def test_inputs_are_what_must_be_there_first():

@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -90,13 +91,79 @@ def test_a_failed_cell_is_reported_and_the_rest_goes_on(tmp_path: Path, made: Pa
     assert not run(plan(DRIVES, store).todo, store, say=lambda line: None).failed
 
 
-def test_a_damaged_input_is_named_and_made_again(tmp_path: Path, made: Path):
+@pytest.mark.parametrize(
+    "fault", ["another content", "a file is gone", "its record is damaged", "its input is gone too"]
+)
+def test_a_damaged_input_is_named_and_made_again(tmp_path: Path, made: Path, fault: str):
+    store, said = Store(tmp_path / "store"), []
+    run(plan(DRIVES[:1], store).todo, store, say=lambda line: None)
+    place = store.place(AGENTS[0])
+    due = plan(DRIVES[:2], store)
+    assert due.todo == (DRIVES[1],)
+    again = [AGENTS[0], DRIVES[1]]
+    match fault:
+        case "another content":
+            (place / "made").write_text("zeros")
+        case "its record is damaged":
+            (place / DONE).write_text("{")
+        case _:
+            (place / "made").unlink()
+    if fault == "its input is gone too":
+        shutil.rmtree(store.place(MIX))
+        again.insert(0, MIX)
+    outcome = run(due.todo, store, say=said.append)
+    assert not outcome.failed
+    assert outcome.computed == again
+    broken = DONE if fault == "its record is damaged" else "made"
+    assert [f"'{place / broken}' is damaged or gone" in line for line in said] == [True]
+    assert (place / "made").read_text() == key(AGENTS[0])
+    store.check(AGENTS[0])
+    # Nothing was thrown away, and what has no need of the damaged file was left alone.
+    assert (store.root / "distill" / f"{key(AGENTS[0])}.damaged" / "cell.json").exists()
+    assert plan(DRIVES[:2], store).todo == ()
+
+
+def test_inputs_of_what_is_done_are_not_looked_at(tmp_path: Path, made: Path, monkeypatch: pytest.MonkeyPatch):
+    store, looked = Store(tmp_path / "store"), []
+    run(plan(DRIVES, store).todo, store, say=lambda line: None)
+    check = store.check
+    monkeypatch.setattr(store, "check", lambda cell: (looked.append(cell), check(cell))[1])
+    assert run(plan(DRIVES, store).todo, store, say=lambda line: None).computed == []
+    assert looked == []
+    more = [replace(DRIVES[0], attack=name) for name in ("fgsm", "uniform")]
+    run(plan(more, store).todo, store, say=lambda line: None)
+    assert looked == [AGENTS[0]]
+
+
+def test_a_damaged_input_that_another_makes_anew_is_waited_for(
+    tmp_path: Path, made: Path, monkeypatch: pytest.MonkeyPatch
+):
     store = Store(tmp_path / "store")
     run(plan(DRIVES[:1], store).todo, store, say=lambda line: None)
-    (store.place(AGENTS[0]) / "made").write_text("zeros")
-    with pytest.raises(RapidError, match="damaged"):
-        store.check(AGENTS[0])
-    assert not store.is_here(AGENTS[0])
+    path = store.place(AGENTS[0]) / "made"
+    path.write_text("half")
+    held, end = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with Store(tmp_path / "store").begin(AGENTS[0]):
+            held.set()
+            end.wait(60)
+            path.write_text(key(AGENTS[0]))
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    assert held.wait(60)
+    sleep = graph.time.sleep
+
+    def wait(seconds: float) -> None:
+        if seconds != graph.POLL:  # somebody else's patience
+            return sleep(seconds)
+        end.set()
+        return thread.join()
+
+    monkeypatch.setattr(graph.time, "sleep", wait)
+    assert run(plan(DRIVES[:2], store).todo, store, say=lambda line: None).computed == [DRIVES[1]]
+    assert end.is_set()
 
 
 def test_two_at_once_share_the_work_and_never_a_cell(tmp_path: Path, made: Path, monkeypatch: pytest.MonkeyPatch):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rapid.cli import main
 from rapid.errors import RapidError
 from rapid.evaluation.metrics import EpisodeRow
 from rapid.experiments import readme, tables
@@ -23,6 +24,13 @@ from rapid.experiments.tables import Entry, Facts, Table, entry
 from rapid.files import write_json
 
 RESULTS = Path(__file__).parents[2] / "results"
+
+
+def command(*words: str) -> object:
+    """Return how a command ends."""
+    with pytest.raises(SystemExit) as stop:
+        main(list(words))
+    return stop.value.code
 
 
 def rows(mean: float, seeds: int, spawns: int = 20) -> list[EpisodeRow]:
@@ -279,6 +287,58 @@ def test_a_layer_keeps_the_commit_of_what_is_no_rows(tmp_path: Path, monkeypatch
     assert again.shown == {"c" * 40: 1}
 
 
+def test_without_a_recipe_each_exhibit_is_shown_in_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    of = open_reproduction(("teachers", "environment"), "", "tiny", tmp_path / "store")
+    assert [of.request(exhibit).recipe for exhibit in of.exhibits] == ["strong", "paper"]
+    assert of.recipes == ["paper", "strong"]
+    assert [line.split()[:2] for line in listing(of).splitlines()[3:5]] == [
+        ["teachers", "strong"],
+        ["environment", "paper"],
+    ]
+    page = write_page(of, tmp_path / "page").read_text()
+    assert "Recipes paper and strong, as the command under each says, scale tiny." in page
+    assert "rapid reproduce teachers --recipe strong --scale tiny" in page
+    assert "rapid reproduce environment --recipe paper --scale tiny" in page
+    alone = open_reproduction(("teachers",), "", "tiny", tmp_path / "store")
+    assert alone.recipes == ["strong"]
+    assert "Recipe strong, scale tiny." in write_page(alone, tmp_path / "alone").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "recipes", "place"),
+    [
+        (["teachers", "environment"], {"teachers": "strong", "environment": "paper"}, "paper-strong-tiny"),
+        (["environment"], {"environment": "paper"}, "paper-tiny"),
+        (["hyperparameters", "--recipe", "strong"], {"hyperparameters": "strong"}, "strong-tiny"),
+    ],
+)
+def test_the_command_takes_each_id_in_its_own_recipe(
+    words: list[str],
+    recipes: dict[str, str],
+    place: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.chdir(tmp_path)
+    assert command("reproduce", *words, "--scale", "tiny", "--dry-run") == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert {line[0]: line[1] for line in lines if line and line[0] in ALL} == recipes
+    assert command("reproduce", *words, "--scale", "tiny", "--page-only") == 0
+    assert [path.name for path in Path("runs/reproduce").iterdir()] == [place]
+
+
+@pytest.mark.parametrize("ids", [(), ("all",), ("attack", "all"), ("all", "robustness")])
+def test_every_id_is_listed_and_all_is_every_one_also_beside_others(ids: tuple[str, ...], tmp_path: Path):
+    of = open_reproduction(ids, "", "tiny", tmp_path / "store")
+    assert [exhibit.id for exhibit in of.exhibits] == list(ALL)
+    assert all(of.request(exhibit).recipe == exhibit.recipes[0] for exhibit in of.exhibits)
+    # A recipe that is named is what all of them are shown in.
+    paper = open_reproduction(ids[:1] if "all" in ids[:1] else (), "paper", "tiny", tmp_path / "store")
+    assert {exhibit.id for exhibit in paper.exhibits} == {name for name in ALL if "paper" in ALL[name].recipes}
+
+
 def test_words_are_those_of_the_presets():
     (facts,) = ALL["hyperparameters"].show(Request("paper", "full"), Store.__new__(Store), ALL["hyperparameters"])
     assert isinstance(facts, Facts)
@@ -290,6 +350,8 @@ def test_words_are_those_of_the_presets():
     [
         (("atack",), "paper", "tiny", "did you mean 'attack'"),
         (("floors",), "paper", "tiny", "only strong"),
+        (("all", "floors"), "paper", "tiny", "only strong"),
+        (("all", "atack"), "", "tiny", "did you mean 'attack'"),
         ((), "papper", "tiny", "did you mean 'paper'"),
         ((), "paper", "long", "tiny, quick, full"),
     ],
@@ -339,6 +401,22 @@ def test_a_page_s_blocks_are_filled_from_the_rows_and_an_unknown_block_is_named(
     assert readme.filled(once, store, Path("page.md")) == once
     with pytest.raises(RapidError, match=r"'page.md' has a block 'teacher'; did you mean 'teachers'"):
         readme.filled(page.replace("teachers:strong", "teacher"), store, Path("page.md"))
+
+
+@pytest.mark.parametrize("option", ["--check", "--readme"])
+def test_where_no_block_is_marked_nothing_is_said_to_be_right(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    assert command("reproduce", option) == 2
+    assert f"no marked block (<!-- table: NAME -->) in README.md or docs/ below '{tmp_path}'" in capsys.readouterr().err
+    assert command("reproduce", "attack", "routing", option) == 2
+    assert "'attack routing' was given. Leave the ids out" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    page = "<!-- table: rates -->\n<!-- end -->\n"
+    Path("README.md").write_text(page)
+    assert command("reproduce", option) == (1 if option == "--check" else 0)
+    assert (Path("README.md").read_text() == page) == (option == "--check")
 
 
 def test_older_rows_stand_in_until_as_many_trainings_are_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -182,8 +182,12 @@ def key(cell: Cell) -> str:
     Other cells stand in it by their keys. A field at the default that it was introduced with is left out, so that a new
     setting changes no key of what was computed without it.
     """
-    content = {"kind": kind_of(cell), "epoch": EPOCH.get(kind_of(cell), 1), **_fields(cell)}
-    return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()[:24]
+    # Kept beside the fields, which never change: thousands of cells are asked again and again, each with its inputs.
+    kept = vars(cell)
+    if "_key" not in kept:
+        content = json.dumps(describe(cell), sort_keys=True, allow_nan=False)
+        kept["_key"] = hashlib.sha256(content.encode()).hexdigest()[:24]
+    return kept["_key"]
 
 
 def describe(cell: Cell) -> dict[str, Any]:

@@ -87,7 +87,8 @@ def run(
 ) -> Outcome:
     """Compute cells, each once its inputs are there; one that fails is reported, and the rest goes on.
 
-    Other processes may compute cells of the same store at the same time: what they hold is waited for.
+    Other processes may compute cells of the same store at the same time: what they hold is waited for. An input that
+    is damaged or gone is computed again first; only those of cells that are to be computed are looked at.
 
     Raises:
         RapidError: the engine cannot be had.
@@ -95,8 +96,31 @@ def run(
     outcome = Outcome()
     left = {key(cell): cell for cell in todo}
     running: dict[int, tuple[Cell, Any, float]] = {}
+    sound: set[str] = set()
+    """Inputs that were found as they were written, or computed here: none is read twice to see that."""
     count = 0
     rate = rates()
+
+    def has(needed: Sequence[Cell]) -> bool:
+        """Look whether inputs are here and whole; what is not, and nobody is at, is computed again."""
+        underway = {key(cell) for cell, _, _ in running.values()}
+        whole = True
+        for each in needed:
+            name = key(each)
+            try:
+                if name not in sound:
+                    store.check(each)
+            except BusyError:
+                return False
+            except RapidError as error:
+                say(str(error))
+            if store.is_here(each):
+                sound.add(name)
+                continue
+            whole = False
+            if name not in underway:
+                left.setdefault(name, each)
+        return whole
 
     def ready() -> list["Job"]:
         """Claim every cell that can be begun."""
@@ -111,7 +135,7 @@ def run(
                 del left[name]
                 outcome.failed[name] = f"its input failed: {title(failed)}"
                 continue
-            if not all(store.is_here(each) for each in needed):
+            if not has(needed):
                 continue
             claim = store.begin(cell)
             try:
@@ -147,6 +171,7 @@ def run(
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
             store.finish(cell, result.seconds, result.cpu_seconds)
+            sound.add(key(cell))
             outcome.computed.append(cell)
             outcome.seconds[kind_of(cell)] = outcome.seconds.get(kind_of(cell), 0.0) + result.seconds
         finally:
@@ -155,8 +180,8 @@ def run(
     predictable = all(work_of(cell)[0] in rate for cell in todo)
 
     def weight(cell: Cell) -> float:
-        name, amount = work_of(cell)
-        return max(amount * rate[name], 1.0) if predictable else 1.0
+        name, amount = work_of(cell)  # of an input that is computed again there may be no rate
+        return max(amount * rate.get(name, 0.0), 1.0) if predictable else 1.0
 
     total, unit = sum(map(weight, todo)), "s of work, as predicted" if predictable else "parts"
     with task("reproduce", total, unit) as work:

@@ -30,6 +30,9 @@ from rapid.runs import commit, versions
 RESULTS = Path("results")
 """Where committed results lie in a checkout; their folder ``cells`` is the store's read-only layer."""
 
+EVERY = "all"
+"""Among ids: every exhibit."""
+
 
 @dataclass(frozen=True)
 class Reproduction:
@@ -37,8 +40,15 @@ class Reproduction:
 
     exhibits: tuple[Exhibit, ...]
     recipe: str
+    """Empty: each exhibit's own first."""
     scale: str
     store: Store
+
+    @property
+    def recipes(self) -> list[str]:
+        """The recipes in which the exhibits are shown."""
+        shown = {self.request(exhibit).recipe for exhibit in self.exhibits}
+        return [recipe for recipe in RECIPES if recipe in shown]
 
     def request(self, exhibit: Exhibit) -> Request:
         """Return the version of an exhibit."""
@@ -56,29 +66,35 @@ class Reproduction:
 def open_reproduction(
     ids: Sequence[str], recipe: str, scale: str, store: Path, layers: Sequence[Path] = ()
 ) -> Reproduction:
-    """Return what is asked for; no id is every exhibit.
+    """Return what is asked for; no id, or `all` among them, is every exhibit that has the recipe.
+
+    No recipe is each exhibit's own first.
 
     Raises:
         RapidError: an id, recipe or scale does not exist, an exhibit lacks the recipe, or the store cannot be used.
     """
-    for kind, value, choices in (("recipe", recipe, RECIPES), ("scale", scale, tuple(EFFORTS))):
+    for kind, value, choices in (("recipe", recipe or RECIPES[0], RECIPES), ("scale", scale, tuple(EFFORTS))):
         if value not in choices:
             raise RapidError(
                 f"Unknown {kind} '{value}'{did_you_mean(value, choices)} Choose one of {', '.join(choices)}."
             )
     for name in ids:
+        if name == EVERY:
+            continue
         if name not in ALL:
             raise RapidError(
-                f"There is no exhibit '{name}'{did_you_mean(name, ALL)} `rapid reproduce` lists them: {', '.join(ALL)}."
+                f"There is no exhibit '{name}'{did_you_mean(name, (EVERY, *ALL))} `rapid reproduce` lists them: "
+                f"{', '.join(ALL)}; `{EVERY}` is every one."
             )
-        if recipe not in ALL[name].recipes:
+        if recipe and recipe not in ALL[name].recipes:
             raise RapidError(
                 f"'{name}' has no recipe '{recipe}', only {', '.join(ALL[name].recipes)}. Give --recipe "
-                f"{ALL[name].recipes[0]}."
+                f"{ALL[name].recipes[0]}, or none: then each is shown in its own."
             )
-    exhibits = tuple(ALL[name] for name in dict.fromkeys(ids)) or tuple(
-        exhibit for exhibit in ALL.values() if recipe in exhibit.recipes
-    )
+    if not ids or EVERY in ids:
+        exhibits = tuple(exhibit for exhibit in ALL.values() if not recipe or recipe in exhibit.recipes)
+    else:
+        exhibits = tuple(ALL[name] for name in dict.fromkeys(ids))
     usual = RESULTS / "cells"
     found = [*layers, *([usual] if usual.is_dir() and usual not in layers else [])]
     for layer in layers:
@@ -100,15 +116,18 @@ def without_layers(of: Reproduction) -> str:
 def listing(of: Reproduction) -> str:
     """Return every exhibit with what is done, predicted time and decisions of language models."""
     lines = [["id", "recipe", "done", "to do", "predicted", "LLM decisions", "what it is"]]
+    every: list[Cell] = []
     for exhibit in of.exhibits:
         request = of.request(exhibit)
-        due = plan(cells_of(exhibit, request.recipe, of.scale), of.store)
+        cells = cells_of(exhibit, request.recipe, of.scale)
+        every += cells
+        due = plan(cells, of.store)
         more = f" + {due.unknown} parts of unknown time" if due.unknown else ""
         time = f"{format_seconds(due.seconds)}{more}" if due.todo else "–"
         lines.append(
             [exhibit.id, request.recipe, str(due.done), str(len(due.todo)), time, str(due.decisions), exhibit.caption]
         )
-    whole = plan(of.cells(), of.store)
+    whole = plan(every, of.store)
     total = f"Together, shared parts once: {len(whole.todo)} to do, {format_seconds(whole.seconds)} for one process"
     asked = f"{whole.decisions} decisions of language models; scale {of.scale}."
     return f"{without_layers(of)}{aligned(lines)}\n\n{total}, as predicted, {asked}"
@@ -175,7 +194,7 @@ def write_page(of: Reproduction, out: Path, outcome: Outcome | None = None) -> P
             tag("h1", "The paper, reproduced"),
             tag(
                 "p",
-                f"Recipe {of.recipe}, scale {of.scale}. Ours: mean and interquartile mean (IQM) with 95 % intervals, "
+                f"{_recipes(of)}, scale {of.scale}. Ours: mean and interquartile mean (IQM) with 95 % intervals, "
                 "crash share, and trainings × spawns; the paper's number as printed. ≈ the paper's mean lies in our "
                 "interval; ▲ our interval lies above it; ▼ below it; fewer than five trainings are no verdict.",
             ),
@@ -206,6 +225,13 @@ def _commits(names: Sequence[str]) -> Markup:
     if "" in names:
         parts.append(Markup("a commit that nobody wrote down"))
     return join(["Measured by ", join(parts, " and "), ". "])
+
+
+def _recipes(of: Reproduction) -> str:
+    """Return the recipes of a page, as its first words."""
+    if len(of.recipes) == 1:
+        return f"Recipe {of.recipes[0]}"
+    return f"Recipes {' and '.join(of.recipes)}, as the command under each says"
 
 
 def _block(shown: Shown, out: Path) -> Markup:

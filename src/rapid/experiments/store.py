@@ -26,7 +26,7 @@ from rapid.evaluation.metrics import EpisodeRow, load_rows, rows_of_table, save_
 from rapid.experiments.cells import Cell, Drive, describe, key, kind_of
 from rapid.experiments.migrate import Legacy, legacy_rows
 from rapid.files import read_json, sha256, write_json, write_text
-from rapid.locks import exclusive
+from rapid.locks import LOCK_FILE, exclusive
 from rapid.runs import commit, versions
 from rapid.training.machinery.record import CHECKPOINT_FILE, load_metrics
 
@@ -91,7 +91,7 @@ class Store:
         place = self.place(cell)
         for path in place.rglob(CHECKPOINT_FILE):
             path.unlink()
-        files = sorted(path for path in place.rglob("*") if path.is_file() and path.name not in (DONE, "lock"))
+        files = sorted(path for path in place.rglob("*") if path.is_file() and path.name not in (DONE, LOCK_FILE))
         write_json(
             place / DONE,
             {
@@ -104,12 +104,42 @@ class Store:
         )
 
     def check(self, cell: Cell) -> None:
-        """Raise RapidError if a file of a done cell is damaged or gone; the cell is then to be made again."""
+        """Look whether the files of a done cell are as they were written; if not, it is no longer done.
+
+        What is left of it is put aside, and nothing is thrown away: it may hold answers that were paid for.
+
+        Raises:
+            rapid.locks.BusyError: it is not, and another process holds the cell, perhaps to make it anew.
+            RapidError: it is not; the cell is to be made anew.
+        """
+        if not self._damaged(cell):
+            return
+        with self.begin(cell) as place:
+            name = self._damaged(cell)  # again: another process may have made it anew meanwhile
+            if not name:
+                return
+            aside = place.with_name(f"{place.name}.damaged")
+            shutil.rmtree(aside, ignore_errors=True)
+            aside.mkdir()
+            (place / DONE).replace(aside / f"{DONE}.old")  # first: a kill in between leaves nothing that looks done
+            for path in [path for path in place.iterdir() if path.name != LOCK_FILE]:
+                path.replace(aside / path.name)
+        raise RapidError(
+            f"'{place / name}' is damaged or gone, so its part is made anew, by this command or by the same one again. "
+            f"What is left of it lies in '{aside}' now."
+        )
+
+    def _damaged(self, cell: Cell) -> str:
+        """Return the name of a file of a done cell that is not as it was written, or nothing."""
         place = self.place(cell)
-        for name, digest in self.provenance(cell)["files"].items():
+        try:
+            files = self.provenance(cell).get("files", {})
+        except RapidError:
+            return DONE
+        for name, digest in files.items():
             if not (place / name).is_file() or sha256(place / name) != digest:
-                (place / DONE).unlink()
-                raise RapidError(f"'{place / name}' is damaged or gone. Run the same command again: it is made anew.")
+                return name
+        return ""
 
     def rows(self, cell: Drive) -> list[EpisodeRow]:
         """Return the episodes of a driven cell.
@@ -231,7 +261,7 @@ def files_of(place: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(place)): path.read_bytes()
         for path in sorted(place.rglob("*"))
-        if path.is_file() and path.name not in ("lock", CHECKPOINT_FILE)
+        if path.is_file() and path.name not in (LOCK_FILE, CHECKPOINT_FILE)
     }
 
 
