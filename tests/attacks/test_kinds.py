@@ -129,7 +129,7 @@ def test_a_transferred_attack_asks_nothing_of_the_agent(roads, texts):
     assert attack.needs == "nothing"
     seen = attack(None, obs, sources(8))
     assert not torch.equal(seen, obs)
-    with pytest.raises(RapidError, match="no agent"):
+    with pytest.raises(RapidError, match="no saved agent"):
         get_attack("transfer:nowhere")
 
 
