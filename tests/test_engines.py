@@ -50,6 +50,18 @@ def test_processes_do_the_same():
     assert not multiprocessing.active_children()
 
 
+def test_a_process_goes_on_with_what_its_own_result_made_ready():
+    ready, pids = [[1]], []
+    for index, (value, pid) in run_jobs(job, (), workers=2, more=lambda: ready.pop() if ready else []):
+        pids.append(pid)
+        assert value == (index + 1) ** 2
+        if index < 3:
+            ready.append([index + 2])
+    assert len(pids) == 4
+    assert len(set(pids)) == 1, "starting a process takes longer than most jobs"
+    assert not multiprocessing.active_children()
+
+
 def test_a_lost_process_is_replaced():
     results = dict(run_jobs(job, [-2, 2, -2, 3, 4], workers=2, lost=lambda index, why: (f"job {index}: {why}", 0)))
     assert [results[index][0] for index in (1, 3, 4)] == [4, 9, 16]

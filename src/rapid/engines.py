@@ -185,12 +185,13 @@ def _in_processes(
                     receive(index, value)
                     continue
                 del running[connection]
-                if waiting.fill():
-                    free.append((connection, process))  # the next job spares its start, which takes seconds
-                else:
+                free.append((connection, process))  # the next job spares its start, which takes seconds
+                yield index, _unpack(kind, value)
+                # Asked now that the result was taken, which may be what others waited for.
+                if not waiting.fill():
+                    free.remove((connection, process))
                     connection.close()  # it ends, and what it has of the memory is others'
                     process.join(_PATIENCE)
-                yield index, _unpack(kind, value)
     finally:
         for connection, job in running.items():
             job.process.terminate()
